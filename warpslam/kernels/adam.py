@@ -1,0 +1,92 @@
+"""Adam (Kingma & Ba 2015) on grid rows, decoder weights and pose vectors.
+
+    m = 0.9 m + 0.1 g;  v = 0.999 v + 0.001 g^2;  x -= lr (m / (1 - 0.9^t)) / (sqrt(v / (1 - 0.999^t)) + 1e-8)
+
+The step count t lives in a device array and is advanced by `advance_step`, so that a recorded iteration can be
+replayed. Only
+selected rows are visited; a row whose gradient is not finite is left alone and counted; each kernel sums the gradient
+buffers of all threads and clears them for the next iteration.
+"""
+
+import warp as wp
+
+from warpslam.kernels.grid import Vec32
+
+
+@wp.func
+def adam_scale(step: int) -> wp.vec2:
+    """(1 / (1 - beta1^t), 1 / (1 - beta2^t))."""
+    t = float(step)
+    return wp.vec2(1.0 / (1.0 - wp.pow(0.9, t)), 1.0 / (1.0 - wp.pow(0.999, t)))
+
+
+@wp.kernel(enable_backward=False)
+def advance_step(step: wp.array(dtype=int)):
+    step[0] = step[0] + 1
+
+
+@wp.kernel(enable_backward=False)
+def adam_rows(
+    start: int,
+    rows: wp.array(dtype=int),
+    step: wp.array(dtype=int),
+    learning_rate: float,
+    x: wp.array(dtype=Vec32),
+    grad: wp.array2d(dtype=Vec32),
+    m: wp.array(dtype=Vec32),
+    v: wp.array(dtype=Vec32),
+    rejected: wp.array(dtype=int),
+):
+    row = rows[start + wp.tid()]
+    g = grad[0, row]
+    grad[0, row] = Vec32()
+    for slot in range(1, grad.shape[0]):
+        g += grad[slot, row]
+        grad[slot, row] = Vec32()
+    total = float(0.0)
+    for k in range(32):
+        total += wp.abs(g[k])
+    if not wp.isfinite(total):
+        # NaN never enters the map: the row keeps its value, and the count tells.
+        rejected[0] = rejected[0] + 1
+        return
+    scale = adam_scale(step[0])
+    m_new = 0.9 * m[row] + 0.1 * g
+    v_new = 0.999 * v[row] + 0.001 * wp.cw_mul(g, g)
+    m[row] = m_new
+    v[row] = v_new
+    change = Vec32()
+    for k in range(32):
+        change[k] = scale[0] * m_new[k] / (wp.sqrt(scale[1] * v_new[k]) + 1.0e-8)
+    x[row] = x[row] - learning_rate * change
+
+
+@wp.kernel(enable_backward=False)
+def clear_moments(rows: wp.array(dtype=int), m: wp.array(dtype=Vec32), v: wp.array(dtype=Vec32)):
+    row = rows[wp.tid()]
+    m[row] = Vec32()
+    v[row] = Vec32()
+
+
+@wp.kernel(enable_backward=False)
+def adam_poses(
+    step: wp.array(dtype=int),
+    rotation_rate: float,
+    translation_rate: float,
+    first: int,
+    x: wp.array(dtype=float, ndim=2),
+    grad: wp.array(dtype=float, ndim=2),
+    m: wp.array(dtype=float, ndim=2),
+    v: wp.array(dtype=float, ndim=2),
+):
+    """Pose vectors (qw, qx, qy, qz, tx, ty, tz); rows below ``first`` stay fixed. Clears the gradient."""
+    f, k = wp.tid()
+    g = grad[f, k]
+    grad[f, k] = 0.0
+    if f < first:
+        return
+    scale = adam_scale(step[0])
+    m[f, k] = 0.9 * m[f, k] + 0.1 * g
+    v[f, k] = 0.999 * v[f, k] + 0.001 * g * g
+    rate = wp.where(k < 4, rotation_rate, translation_rate)
+    x[f, k] = x[f, k] - rate * scale[0] * m[f, k] / (wp.sqrt(scale[1] * v[f, k]) + 1.0e-8)

@@ -1,0 +1,162 @@
+"""Occupancy and volume rendering (Eq. 5-7).
+
+    alpha_i = sigmoid(10 logit_i),  1 for samples outside the map's bound (logit 100)
+    w_i     = alpha_i T_i,          T_i = prod_{j < i} (1 - alpha_j + 1e-10)
+    depth   = sum w_i z_i,   rgb = sum w_i c_i,   variance = sum w_i (z_i - depth)^2
+
+Adjoint, for incoming d_depth and d_rgb (the losses detach the variance), with g_i = d_depth z_i + d_rgb . c_i:
+
+    d_alpha_i = g_i T_i - sum_{k > i} g_k w_k / (1 - alpha_i + 1e-10),   d_logit_i = 10 alpha_i (1 - alpha_i) d_alpha_i
+    d_c_i     = w_i d_rgb
+
+Samples with w_i < ``min_weight`` need no colour: it is taken as black, so that rgb errs by less than sample_count *
+min_weight.
+Per-sample arrays have shape (ray_count * sample_count,). Rays that are not kept render 0 and have no gradient.
+"""
+
+import warp as wp
+
+OUTSIDE_LOGIT = wp.constant(100.0)
+
+
+@wp.func
+def is_inside(p: wp.vec3, low: wp.vec3, high: wp.vec3) -> bool:
+    return p[0] > low[0] and p[0] < high[0] and p[1] > low[1] and p[1] < high[1] and p[2] > low[2] and p[2] < high[2]
+
+
+@wp.func
+def occupancy(logit: float) -> float:
+    return 1.0 / (1.0 + wp.exp(-10.0 * logit))
+
+
+@wp.kernel(enable_backward=False)
+def composite(
+    sample_count: int,
+    low: wp.vec3,
+    high: wp.vec3,
+    ray_origin: wp.array(dtype=wp.vec3),
+    ray_direction: wp.array(dtype=wp.vec3),
+    z: wp.array(dtype=float),
+    keep: wp.array(dtype=int),
+    logit: wp.array(dtype=float),
+    weight: wp.array(dtype=float),
+    depth: wp.array(dtype=float),
+    variance: wp.array(dtype=float),
+):
+    tid = wp.tid()
+    d = float(0.0)
+    v = float(0.0)
+    if keep[tid] != 0:
+        first = tid * sample_count
+        transmittance = float(1.0)
+        for n in range(sample_count):
+            i = first + n
+            if not is_inside(ray_origin[tid] + z[i] * ray_direction[tid], low, high):
+                logit[i] = OUTSIDE_LOGIT
+            alpha = occupancy(logit[i])
+            w = alpha * transmittance
+            transmittance *= 1.0 - alpha + 1.0e-10
+            weight[i] = w
+            d += w * z[i]
+        for n in range(sample_count):
+            e = z[first + n] - d
+            v += weight[first + n] * e * e
+    depth[tid] = d
+    variance[tid] = v
+
+
+@wp.kernel(enable_backward=False)
+def composite_color(
+    sample_count: int,
+    keep: wp.array(dtype=int),
+    color: wp.array(dtype=wp.vec3),
+    weight: wp.array(dtype=float),
+    rgb: wp.array(dtype=wp.vec3),
+):
+    tid = wp.tid()
+    c = wp.vec3()
+    if keep[tid] != 0:
+        for n in range(sample_count):
+            i = tid * sample_count + n
+            c += weight[i] * color[i]
+    rgb[tid] = c
+
+
+@wp.kernel(enable_backward=False)
+def surface_depth(
+    sample_count: int,
+    keep: wp.array(dtype=int),
+    z: wp.array(dtype=float),
+    logit: wp.array(dtype=float),
+    weight: wp.array(dtype=float),
+    min_occupancy: float,
+    depth: wp.array(dtype=float),
+):
+    """Depth of the first sample that is occupied, or, where none is, of that at which half of the ray's weight is
+    spent.
+    """
+    tid = wp.tid()
+    first = tid * sample_count
+    total = float(0.0)
+    for n in range(sample_count):
+        total += weight[first + n]
+    spent = float(0.0)
+    halfway = float(0.0)
+    surface = float(0.0)
+    if keep[tid] != 0:
+        for n in range(sample_count):
+            i = first + n
+            spent += weight[i]
+            if halfway == 0.0 and spent >= 0.5 * total:
+                halfway = z[i]
+            if surface == 0.0 and logit[i] != OUTSIDE_LOGIT and occupancy(logit[i]) >= min_occupancy:
+                surface = z[i]
+    depth[tid] = wp.where(surface > 0.0, surface, halfway)
+
+
+@wp.kernel(enable_backward=False)
+def composite_backward(
+    sample_count: int,
+    z: wp.array(dtype=float),
+    keep: wp.array(dtype=int),
+    logit: wp.array(dtype=float),
+    with_color: int,
+    color: wp.array(dtype=wp.vec3),
+    weight: wp.array(dtype=float),
+    min_weight: float,
+    depth_grad: wp.array(dtype=float),
+    rgb_grad: wp.array(dtype=wp.vec3),
+    logit_grad: wp.array(dtype=float),
+    color_grad: wp.array(dtype=wp.vec3),
+):
+    tid = wp.tid()
+    first = tid * sample_count
+    kept = keep[tid] != 0
+    d_depth = depth_grad[tid]
+    d_rgb = rgb_grad[tid]
+    # Consumed here, like the adjoint of a store: the next iteration's losses add to zero.
+    depth_grad[tid] = 0.0
+    rgb_grad[tid] = wp.vec3()
+    behind = float(0.0)
+    for m in range(sample_count):
+        i = first + sample_count - 1 - m
+        gradient = float(0.0)
+        if kept:
+            w = weight[i]
+            g = d_depth * z[i]
+            if with_color != 0:
+                g += wp.dot(d_rgb, color[i])
+                color_grad[i] = wp.where(w < min_weight, wp.vec3(), w * d_rgb)
+            # 100 marks a sample outside the bound: opaque, and constant.
+            if logit[i] != OUTSIDE_LOGIT:
+                alpha = occupancy(logit[i])
+                free = 1.0 - alpha
+                # g_i T_i = g_i w_i / alpha_i; alpha > 0 unless the exponential overflowed, and then w and the
+                # gradient are 0.
+                if alpha > 0.0:
+                    gradient = 10.0 * free * (g * w - alpha * behind / (free + 1.0e-10))
+            behind += g * w
+        else:
+            if with_color != 0:
+                color_grad[i] = wp.vec3()
+        logit_grad[i] = gradient

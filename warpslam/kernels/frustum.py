@@ -1,0 +1,81 @@
+"""Frustum feature selection (A.1, Sec. 3.3): which vertices of a grid the current frame may change.
+
+A vertex is selected if it projects inside the image and lies in front of the camera, no deeper than 0.5 m behind the
+measured surface
+(bilinear depth at its pixel; the largest looked-up depth where there is none), or if it is within 0.5 m of the camera
+centre.
+"""
+
+import warp as wp
+
+from warpslam.kernels.grid import Lattice, row_of
+
+
+@wp.func
+def bilinear_depth(image: wp.array2d(dtype=float), u: float, v: float) -> float:
+    """Bilinear lookup, 0 outside the image."""
+    height = image.shape[0]
+    width = image.shape[1]
+    u0 = int(wp.floor(u))
+    v0 = int(wp.floor(v))
+    fu = u - float(u0)
+    fv = v - float(v0)
+    total = float(0.0)
+    for dv in range(2):
+        for du in range(2):
+            x = u0 + du
+            y = v0 + dv
+            if x >= 0 and x < width and y >= 0 and y < height:
+                total += wp.where(du == 1, fu, 1.0 - fu) * wp.where(dv == 1, fv, 1.0 - fv) * image[y, x]
+    return total
+
+
+@wp.kernel(enable_backward=False)
+def project_vertices(
+    lattice: Lattice,
+    T_camera_world: wp.mat44,
+    focal: wp.vec2,
+    center: wp.vec2,
+    image: wp.array2d(dtype=float),
+    looked_up: wp.array(dtype=float),
+    vertex_depth: wp.array(dtype=float),
+    max_depth: wp.array(dtype=float),
+):
+    """First pass: depth of the vertex (-1 where it does not project inside the image) and measured depth at its pixel.
+    """
+    i, j, k = wp.tid()
+    row = row_of(lattice, i, j, k)
+    spacing = wp.cw_div(wp.vec3(1.0, 1.0, 1.0), lattice.inverse_spacing)
+    p = lattice.origin + wp.cw_mul(wp.vec3(float(i), float(j), float(k)), spacing)
+    q = wp.transform_point(T_camera_world, p)
+    # The released code divides by (z - 1e-5) with its camera looking along -z.
+    depth = q[2] - 1.0e-5
+    u = focal[0] * q[0] / depth + center[0]
+    v = focal[1] * q[1] / depth + center[1]
+    measured = bilinear_depth(image, u, v)
+    wp.atomic_max(max_depth, 0, measured)
+    inside = u > 0.0 and u < float(image.shape[1]) and v > 0.0 and v < float(image.shape[0]) and depth >= 0.0
+    vertex_depth[row] = wp.where(inside, depth, -1.0)
+    looked_up[row] = measured
+
+
+@wp.kernel(enable_backward=False)
+def select_vertices(
+    lattice: Lattice,
+    camera_center: wp.vec3,
+    margin: float,
+    looked_up: wp.array(dtype=float),
+    vertex_depth: wp.array(dtype=float),
+    max_depth: wp.array(dtype=float),
+    selected: wp.array(dtype=wp.uint8),
+):
+    i, j, k = wp.tid()
+    row = row_of(lattice, i, j, k)
+    spacing = wp.cw_div(wp.vec3(1.0, 1.0, 1.0), lattice.inverse_spacing)
+    p = lattice.origin + wp.cw_mul(wp.vec3(float(i), float(j), float(k)), spacing)
+    measured = looked_up[row]
+    if measured == 0.0:
+        measured = max_depth[0]
+    depth = vertex_depth[row]
+    chosen = (depth >= 0.0 and depth <= measured + margin) or wp.length(p - camera_center) < margin
+    selected[row] = wp.where(chosen, wp.uint8(1), wp.uint8(0))

@@ -1,0 +1,182 @@
+"""Feature grids: lattice, the one function from a vertex to its row, trilinear lookup and its adjoint.
+
+A level stores one row of 32 features per lattice vertex, array ``features`` of shape (row_count,), dtype `Vec32`.
+
+    u    = (p - origin) / spacing, clamped to [0, shape - 1] on every axis
+    c(p) = sum over the 8 corners of the cell: w_corner(u) * features[row_of(corner)]
+
+Adjoint for an incoming gradient dc: ``grad[row] += w_corner * dc`` for rows that are selected, and
+``dp = sum_corner (dw_corner / du) (dc . features[row]) / spacing``, zero along an axis that was clamped.
+"""
+
+import warp as wp
+
+FEATURE_DIM = 32
+Vec32 = wp.types.vector(length=FEATURE_DIM, dtype=wp.float32)
+
+
+@wp.struct
+class Lattice:
+    """Vertex (i, j, k) lies at ``origin + (i, j, k) / inverse_spacing`` [m]."""
+
+    origin: wp.vec3
+    inverse_spacing: wp.vec3
+    shape: wp.vec3i
+
+
+@wp.struct
+class Cell:
+    """Where a point lies in the lattice: lower corner, offset inside the cell in [0, 1], 1 on axes that are not
+    clamped.
+    """
+
+    corner: wp.vec3i
+    offset: wp.vec3
+    free: wp.vec3
+
+
+@wp.func
+def row_of(lattice: Lattice, i: int, j: int, k: int) -> int:
+    """Row of a lattice vertex. Everything that touches features goes through here."""
+    return (i * lattice.shape[1] + j) * lattice.shape[2] + k
+
+
+@wp.func
+def find_cell(lattice: Lattice, p: wp.vec3) -> Cell:
+    cell = Cell()
+    u = wp.cw_mul(p - lattice.origin, lattice.inverse_spacing)
+    for axis in range(3):
+        last = lattice.shape[axis] - 1
+        x = u[axis]
+        free = float(1.0)
+        # Border padding; the gradient along a clamped axis is zero (grid_sample's rule).
+        if x <= 0.0:
+            x = float(0.0)
+            free = float(0.0)
+        if x >= float(last):
+            x = float(last)
+            free = float(0.0)
+        low = wp.min(int(x), last - 1)
+        cell.corner[axis] = low
+        cell.offset[axis] = x - float(low)
+        cell.free[axis] = free
+    return cell
+
+
+@wp.func
+def corner_weight(offset: wp.vec3, di: int, dj: int, dk: int) -> float:
+    wx = wp.where(di == 1, offset[0], 1.0 - offset[0])
+    wy = wp.where(dj == 1, offset[1], 1.0 - offset[1])
+    wz = wp.where(dk == 1, offset[2], 1.0 - offset[2])
+    return wx * wy * wz
+
+
+@wp.func
+def interpolate(features: wp.array(dtype=Vec32), lattice: Lattice, cell: Cell) -> Vec32:
+    """Trilinear features at a point."""
+    i = cell.corner[0]
+    j = cell.corner[1]
+    k = cell.corner[2]
+    c = Vec32()
+    for di in range(2):
+        for dj in range(2):
+            for dk in range(2):
+                row = row_of(lattice, i + di, j + dj, k + dk)
+                c += corner_weight(cell.offset, di, dj, dk) * features[row]
+    return c
+
+
+@wp.func
+def dot32(a: Vec32, b: Vec32) -> float:
+    # A tree sum: `wp.dot` is one serial chain of 32 additions on the CPU backend.
+    s0 = float(0.0)
+    s1 = float(0.0)
+    s2 = float(0.0)
+    s3 = float(0.0)
+    for k in range(8):
+        s0 += a[k] * b[k]
+        s1 += a[k + 8] * b[k + 8]
+        s2 += a[k + 16] * b[k + 16]
+        s3 += a[k + 24] * b[k + 24]
+    return (s0 + s1) + (s2 + s3)
+
+
+@wp.func
+def interpolate_adjoint_point(features: wp.array(dtype=Vec32), lattice: Lattice, cell: Cell, dc: Vec32) -> wp.vec3:
+    """Gradient with respect to the point."""
+    i = cell.corner[0]
+    j = cell.corner[1]
+    k = cell.corner[2]
+    f = cell.offset
+    du = wp.vec3()
+    for di in range(2):
+        for dj in range(2):
+            for dk in range(2):
+                s = dot32(dc, features[row_of(lattice, i + di, j + dj, k + dk)])
+                wx = wp.where(di == 1, f[0], 1.0 - f[0])
+                wy = wp.where(dj == 1, f[1], 1.0 - f[1])
+                wz = wp.where(dk == 1, f[2], 1.0 - f[2])
+                du += s * wp.vec3(
+                    wp.where(di == 1, wy * wz, -wy * wz),
+                    wp.where(dj == 1, wx * wz, -wx * wz),
+                    wp.where(dk == 1, wx * wy, -wx * wy),
+                )
+    return wp.cw_mul(wp.cw_mul(du, cell.free), lattice.inverse_spacing)
+
+
+@wp.func
+def interpolate_adjoint_features(
+    grad: wp.array2d(dtype=Vec32),
+    slot: int,
+    selected: wp.array(dtype=wp.uint8),
+    lattice: Lattice,
+    cell: Cell,
+    dc: Vec32,
+):
+    """Add the gradient to the selected ones of the 8 rows, in gradient buffer ``slot`` (one a CPU thread)."""
+    i = cell.corner[0]
+    j = cell.corner[1]
+    k = cell.corner[2]
+    for di in range(2):
+        for dj in range(2):
+            for dk in range(2):
+                row = row_of(lattice, i + di, j + dj, k + dk)
+                if selected[row] != wp.uint8(0):
+                    wp.atomic_add(grad, slot, row, corner_weight(cell.offset, di, dj, dk) * dc)
+
+
+@wp.func
+def init_normal(seed: int, level: int, i: int, j: int, k: int, std: float) -> Vec32:
+    """Random features of a vertex from its world lattice index: the same whenever and in whatever order it is made."""
+    state = wp.rand_init(seed + 7919 * level, ((i * 73856093) ^ (j * 19349663)) ^ (k * 83492791))
+    c = Vec32()
+    for n in range(32):
+        c[n] = std * wp.randn(state)
+    return c
+
+
+@wp.kernel(enable_backward=False)
+def fill_grid(
+    lattice: Lattice,
+    first: wp.vec3i,
+    seed: int,
+    level: int,
+    std: float,
+    old_lattice: Lattice,
+    old_features: wp.array(dtype=Vec32),
+    shift: wp.vec3i,
+    features: wp.array(dtype=Vec32),
+):
+    """Fill a grid of any extent: rows of the old grid are kept, the others start random (``first``: world index of
+    vertex 0).
+    """
+    i, j, k = wp.tid()
+    row = row_of(lattice, i, j, k)
+    a = i - shift[0]
+    b = j - shift[1]
+    c = k - shift[2]
+    s = old_lattice.shape
+    if a >= 0 and b >= 0 and c >= 0 and a < s[0] and b < s[1] and c < s[2]:
+        features[row] = old_features[row_of(old_lattice, a, b, c)]
+    else:
+        features[row] = init_normal(seed, level, first[0] + i, first[1] + j, first[2] + k, std)

@@ -1,0 +1,246 @@
+"""Pixels, rays and samples (Sec. 3.3, "stratified and near-surface sampling"; constants of the released code).
+
+    d_camera = ((u - cx) / fx, (v - cy) / fy, 1)      OpenCV axes, not normalised, so that the ray parameter is z-depth
+    o, d     = t, R(q) d_camera                       pose vector (qw, qx, qy, qz, tx, ty, tz), q of any length
+    t_exit   = min over axes of max over the two planes of (plane - o) / d
+    kept     : t_exit >= D                            D = 0 (no measurement) passes
+
+Samples along a kept ray, with s in [0, 1] evenly spaced and D_max the largest D of the kept rays of the batch:
+
+    32 over [near, far]: near = 0.01 D, far = clamp(t_exit + 0.01, 0, 1.2 D_max); without depth near = 0.01, far =
+    t_exit + 0.01
+    16 near the surface: D > 0: [0.95 D, 1.05 D]; D = 0: [0.001, D_max]
+
+merged in ascending order into ``z``, shape (ray_count * sample_count,). Gradients reach o and d, never z: `cast_rays`
+is
+differentiated by the tape, the other kernels have no gradient.
+"""
+
+import warp as wp
+
+wp.set_module_options({"max_unroll": 16})
+
+
+@wp.func
+def rotation_from_quaternion(w: float, x: float, y: float, z: float) -> wp.mat33:
+    s = 2.0 / (w * w + x * x + y * y + z * z)
+    return wp.mat33(
+        1.0 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w),
+        s * (x * y + z * w), 1.0 - s * (x * x + z * z), s * (y * z - x * w),
+        s * (x * z - y * w), s * (y * z + x * w), 1.0 - s * (x * x + y * y),
+    )  # fmt: skip
+
+
+@wp.kernel(enable_backward=False)
+def draw_pixels(
+    seed: int,
+    rays_per_frame: int,
+    window: wp.array(dtype=int),
+    edge_u: int,
+    edge_v: int,
+    focal: wp.vec2,
+    center: wp.vec2,
+    rgb_images: wp.array(dtype=wp.uint8, ndim=4),
+    depth_images: wp.array(dtype=wp.uint16, ndim=3),
+    depth_scales: wp.array(dtype=float),
+    frame: wp.array(dtype=int),
+    direction_camera: wp.array(dtype=wp.vec3),
+    depth: wp.array(dtype=float),
+    rgb: wp.array(dtype=wp.vec3),
+):
+    """Uniform pixels, with replacement, inside the border; ``window[f]`` is the image slot of frame f of the window."""
+    tid = wp.tid()
+    f = tid // rays_per_frame
+    slot = window[f]
+    height = depth_images.shape[1]
+    width = depth_images.shape[2]
+    state = wp.rand_init(seed, tid)
+    u = wp.randi(state, edge_u, width - edge_u)
+    v = wp.randi(state, edge_v, height - edge_v)
+    frame[tid] = f
+    direction_camera[tid] = wp.vec3((float(u) - center[0]) / focal[0], (float(v) - center[1]) / focal[1], 1.0)
+    depth[tid] = float(depth_images[slot, v, u]) * depth_scales[slot]
+    rgb[tid] = (
+        wp.vec3(float(rgb_images[slot, v, u, 0]), float(rgb_images[slot, v, u, 1]), float(rgb_images[slot, v, u, 2]))
+        / 255.0
+    )
+
+
+@wp.kernel(enable_backward=False)
+def grid_pixels(
+    first_row: int,
+    width: int,
+    stride: int,
+    focal: wp.vec2,
+    center: wp.vec2,
+    frame: wp.array(dtype=int),
+    direction_camera: wp.array(dtype=wp.vec3),
+):
+    """Rays of consecutive pixels, row by row, every ``stride``-th pixel: for whole images."""
+    tid = wp.tid()
+    u = stride * (tid % width)
+    v = stride * (first_row + tid // width)
+    frame[tid] = 0
+    direction_camera[tid] = wp.vec3((float(u) - center[0]) / focal[0], (float(v) - center[1]) / focal[1], 1.0)
+
+
+@wp.kernel
+def cast_rays(
+    poses: wp.array(dtype=float, ndim=2),
+    frame: wp.array(dtype=int),
+    direction_camera: wp.array(dtype=wp.vec3),
+    ray_origin: wp.array(dtype=wp.vec3),
+    ray_direction: wp.array(dtype=wp.vec3),
+):
+    tid = wp.tid()
+    f = frame[tid]
+    R = rotation_from_quaternion(poses[f, 0], poses[f, 1], poses[f, 2], poses[f, 3])
+    ray_direction[tid] = R * direction_camera[tid]
+    ray_origin[tid] = wp.vec3(poses[f, 4], poses[f, 5], poses[f, 6])
+
+
+@wp.kernel(enable_backward=False)
+def bound_rays(
+    low: wp.vec3,
+    high: wp.vec3,
+    ray_origin: wp.array(dtype=wp.vec3),
+    ray_direction: wp.array(dtype=wp.vec3),
+    depth: wp.array(dtype=float),
+    use_depth: int,
+    t_exit: wp.array(dtype=float),
+    keep: wp.array(dtype=int),
+    max_depth: wp.array(dtype=float),
+):
+    """Exit distance from the map's bound, whether the ray is kept, and the largest depth of the kept rays."""
+    tid = wp.tid()
+    o = ray_origin[tid]
+    d = ray_direction[tid]
+    t = float(1.0e10)
+    for axis in range(3):
+        if d[axis] != 0.0:
+            t = wp.min(t, wp.max((low[axis] - o[axis]) / d[axis], (high[axis] - o[axis]) / d[axis]))
+    t_exit[tid] = t
+    kept = int(1)
+    if use_depth != 0:
+        kept = wp.where(t >= depth[tid], 1, 0)
+        if kept == 1:
+            wp.atomic_max(max_depth, 0, depth[tid])
+    keep[tid] = kept
+
+
+@wp.func
+def fraction(k: int, count: int, jitter: int, state: wp.uint32) -> float:
+    """s of sample k of ``count``: even, or (Sec. 3.3) uniform between the midpoints to its neighbours."""
+    s = float(k) / float(count - 1)
+    if jitter != 0:
+        step = 1.0 / float(count - 1)
+        low = wp.max(s - 0.5 * step, 0.0)
+        high = wp.min(s + 0.5 * step, 1.0)
+        random = wp.rand_init(int(state), k)
+        s = low + (high - low) * wp.randf(random)
+    return s
+
+
+@wp.func
+def stratum(k: int, count: int, near: float, far: float, jitter: int, state: wp.uint32) -> float:
+    s = fraction(k, count, jitter, state)
+    return near * (1.0 - s) + far * s
+
+
+@wp.func
+def surface_sample(k: int, count: int, depth: float, max_depth: float, jitter: int, state: wp.uint32) -> float:
+    # Other random numbers than those of the strata.
+    s = fraction(k, count, jitter, state + wp.uint32(1000003))
+    if depth > 0.0:
+        return 0.95 * depth * (1.0 - s) + 1.05 * depth * s
+    return 0.001 * (1.0 - s) + max_depth * s
+
+
+@wp.func
+def place_ray(
+    tid: int,
+    count: int,
+    surface_count: int,
+    near: float,
+    far: float,
+    depth: float,
+    max_depth: float,
+    jitter: int,
+    state: wp.uint32,
+    z: wp.array(dtype=float),
+):
+    # Both sequences ascend, so that sorting is one merge.
+    total = count + surface_count
+    a = int(0)
+    b = int(0)
+    za = stratum(0, count, near, far, jitter, state)
+    zb = float(0.0)
+    if surface_count > 0:
+        zb = surface_sample(0, surface_count, depth, max_depth, jitter, state)
+    for n in range(total):
+        take_a = a < count
+        if take_a and b < surface_count:
+            take_a = za <= zb
+        if take_a:
+            z[tid * total + n] = za
+            a += 1
+            if a < count:
+                za = stratum(a, count, near, far, jitter, state)
+        else:
+            z[tid * total + n] = zb
+            b += 1
+            if b < surface_count:
+                zb = surface_sample(b, surface_count, depth, max_depth, jitter, state)
+
+
+@wp.kernel(enable_backward=False)
+def place_samples(
+    seed: int,
+    jitter: int,
+    count: int,
+    surface_count: int,
+    use_depth: int,
+    depth: wp.array(dtype=float),
+    t_exit: wp.array(dtype=float),
+    keep: wp.array(dtype=int),
+    max_depth: wp.array(dtype=float),
+    z: wp.array(dtype=float),
+):
+    tid = wp.tid()
+    if keep[tid] == 0:
+        return
+    near = float(0.01)
+    far = t_exit[tid] + 0.01
+    largest = float(0.0)
+    measured = float(0.0)
+    if use_depth != 0:
+        measured = depth[tid]
+        largest = max_depth[0]
+        near = 0.01 * measured
+        far = wp.clamp(far, 0.0, 1.2 * largest)
+    state = wp.rand_init(seed ^ 0x5BD1E995, tid)
+    place_ray(tid, count, surface_count, near, far, measured, largest, jitter, state, z)
+
+
+@wp.kernel(enable_backward=False)
+def collect_ray_gradients(
+    sample_count: int,
+    keep: wp.array(dtype=int),
+    z: wp.array(dtype=float),
+    point_grad: wp.array(dtype=wp.vec3),
+    origin_grad: wp.array(dtype=wp.vec3),
+    direction_grad: wp.array(dtype=wp.vec3),
+):
+    """Adjoint of p = o + z d, summed over the samples of a ray; clears ``point_grad`` for the next iteration."""
+    tid = wp.tid()
+    if keep[tid] == 0:
+        return
+    do = wp.vec3()
+    dd = wp.vec3()
+    for n in range(sample_count):
+        g = point_grad[tid * sample_count + n]
+        do += g
+        dd += z[tid * sample_count + n] * g
+        point_grad[tid * sample_count + n] = wp.vec3()
+    origin_grad[tid] = origin_grad[tid] + do
+    direction_grad[tid] = direction_grad[tid] + dd
