@@ -1,0 +1,56 @@
+"""What every reader returns: frames with depth in metres and poses in OpenCV axes."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpslam.camera import Intrinsics
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One RGB-D frame.
+
+    index: Position in the sequence.
+    timestamp: Time [s]; readers of formats without times use index / 30.
+    rgb: Colour image, uint8, shape (H, W, 3), RGB order.
+    depth: z-depth [m], float32, shape (H, W), 0 = missing.
+    T_world_camera: Ground-truth camera-to-world transform, float64, shape (4, 4), OpenCV axes; None where unknown.
+    """
+
+    index: int
+    timestamp: float
+    rgb: np.ndarray
+    depth: np.ndarray
+    T_world_camera: np.ndarray | None = None
+
+
+class RgbdSequence(ABC):
+    """A random-access RGB-D sequence.
+
+    name: Short name, used for the run folder.
+    intrinsics: Camera of the frames as returned, that is after undistortion, resizing and cropping.
+    preset: Name of the settings that suit the sequence (see `warpslam.config.PRESETS`).
+    """
+
+    name: str
+    intrinsics: Intrinsics
+    preset: str = "default"
+
+    @abstractmethod
+    def __len__(self) -> int: ...
+
+    @abstractmethod
+    def __getitem__(self, index: int) -> Frame: ...
+
+    def __iter__(self) -> Iterator[Frame]:
+        for index in range(len(self)):
+            yield self[index]
+
+    def ground_truth(self) -> np.ndarray | None:
+        """All ground-truth poses, float64, shape (N, 4, 4), NaN-filled where one is unknown; None if there are none."""
+        return None

@@ -1,0 +1,166 @@
+"""The camera of a stored sequence: intrinsics, depth unit, distortion, and how frames are resized and cropped."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from warpslam.camera import Intrinsics
+from warpslam.errors import ConfigError, DatasetError
+
+CAMERA_FIELDS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale")
+CAMERA_FILE = "camera.yaml"
+_OPTIONAL_FIELDS = ("distortion", "resize", "crop")
+_DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Camera of the images as stored, and what the reader does to them before returning a frame.
+
+    stored: Intrinsics of the stored depth images (and of the colour images once they have that size).
+    depth_scale: Stored depth units per metre.
+    distortion: OpenCV coefficients (k1, k2, p1, p2, k3, ...) of the colour images; empty = none.
+    resize: Size (width, height) to which frames are resized first; None = as stored.
+    crop: Border [pixels] cut from every side after resizing.
+    source: Where the numbers come from, for messages.
+    """
+
+    stored: Intrinsics
+    depth_scale: float
+    distortion: tuple[float, ...] = ()
+    resize: tuple[int, int] | None = None
+    crop: int = 0
+    source: str = "camera"
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Intrinsics of the frames as returned."""
+        resized = self.stored if self.resize is None else self.stored.scaled(*self.resize)
+        return resized.cropped(self.crop) if self.crop else resized
+
+    @classmethod
+    def from_fields(cls, fields: dict[str, Any], source: str) -> Calibration:
+        """Check and convert a mapping with `CAMERA_FIELDS` and, where wanted, distortion, resize, crop."""
+        unknown = sorted(set(map(str, fields)) - set(CAMERA_FIELDS) - set(_OPTIONAL_FIELDS))
+        if unknown:
+            known = ", ".join(CAMERA_FIELDS + _OPTIONAL_FIELDS)
+            raise DatasetError(f"{source}: unknown field {', '.join(unknown)}; known fields are {known}")
+        missing = [name for name in CAMERA_FIELDS if name not in fields]
+        if missing:
+            raise DatasetError(f"{source}: field {', '.join(missing)} is missing; add it")
+        values = {name: _number(fields[name], name, source) for name in CAMERA_FIELDS}
+        depth_scale = values.pop("depth_scale")
+        if depth_scale <= 0:
+            raise DatasetError(
+                f"{source}: depth_scale = {depth_scale:g} must be positive: stored depth units per metre, "
+                "1000 for millimetres"
+            )
+        width, height = (_whole(values.pop(name), name, source) for name in ("width", "height"))
+        resize = fields.get("resize")
+        if resize is not None:
+            pair = _numbers(resize, "resize", source)
+            if len(pair) != 2 or min(pair) < 1:
+                raise DatasetError(f"{source}: resize = {resize!r} must be [width, height] in pixels")
+            resize = (_whole(pair[0], "resize", source), _whole(pair[1], "resize", source))
+        distortion = _numbers(fields.get("distortion") or (), "distortion", source)
+        if len(distortion) not in _DISTORTION_LENGTHS:
+            raise DatasetError(
+                f"{source}: distortion has {len(distortion)} numbers; give OpenCV's k1, k2, p1, p2, k3 or leave it out"
+            )
+        crop = _whole(_number(fields.get("crop") or 0, "crop", source), "crop", source)
+        if crop < 0:
+            raise DatasetError(f"{source}: crop = {crop} must be 0 or more pixels")
+        try:
+            stored = Intrinsics(**values, width=width, height=height)
+            calibration = cls(stored, depth_scale, distortion, resize, crop, source)
+            # A crop larger than the image shows here.
+            _ = calibration.intrinsics
+        except ConfigError as error:
+            raise DatasetError(f"{source}: {error}") from error
+        return calibration
+
+    @classmethod
+    def from_yaml(cls, path: Path) -> Calibration:
+        """Read a ``camera.yaml``."""
+        return cls.from_fields(_load_yaml(path.read_bytes(), str(path)), str(path))
+
+    @classmethod
+    def from_text(cls, text: str) -> Calibration:
+        """Parse "fx,fy,cx,cy,width,height,depth_scale"."""
+        parts = [part.strip() for part in text.replace(";", ",").split(",")]
+        if len(parts) != len(CAMERA_FIELDS):
+            raise DatasetError(
+                f"camera = {text!r} has {len(parts)} numbers; give {len(CAMERA_FIELDS)}: {','.join(CAMERA_FIELDS)}"
+            )
+        return cls.from_fields(dict(zip(CAMERA_FIELDS, parts, strict=True)), f"camera = {text!r}")
+
+    @classmethod
+    def of_dataset(cls, name: str) -> Calibration:
+        """The camera that comes with the package as ``cameras/<name>.yaml``."""
+        file = resources.files("warpslam.sequences") / "cameras" / f"{name}.yaml"
+        source = f"built-in camera {name}"
+        return cls.from_fields(_load_yaml(file.read_bytes(), source), source)
+
+
+def find_calibration(folder: Path, camera: str | None, default: str | None, remedy: str = "") -> Calibration:
+    """Camera of the sequence in ``folder``: the argument, else the folder's camera.yaml, else the built-in ``default``.
+
+    Raises:
+        DatasetError: If the numbers can't be used, or there is none of the three (then ``remedy`` ends the message).
+    """
+    if camera is not None:
+        return Calibration.from_text(camera)
+    if has_own_camera(folder):
+        return Calibration.from_yaml(folder / CAMERA_FILE)
+    if default is None:
+        raise DatasetError(
+            f"{folder}: camera unknown. {remedy}Write a camera.yaml with {', '.join(CAMERA_FIELDS)} into the folder "
+            f"or give the camera as {','.join(CAMERA_FIELDS)}"
+        )
+    return Calibration.of_dataset(default)
+
+
+def has_own_camera(folder: Path) -> bool:
+    """Whether the sequence in ``folder`` brings its camera.yaml."""
+    return (folder / CAMERA_FILE).is_file()
+
+
+def _load_yaml(text: bytes, source: str) -> dict[str, Any]:
+    import yaml
+
+    try:
+        fields = yaml.safe_load(text)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise DatasetError(
+            f"{source}: not valid YAML ({' '.join(str(error).split())}); write one 'name: number' a line"
+        ) from error
+    if not isinstance(fields, dict):
+        raise DatasetError(f"{source}: holds no fields; write one 'name: number' a line for {', '.join(CAMERA_FIELDS)}")
+    return fields
+
+
+def _number(value: Any, name: str, source: str) -> float:
+    # YAML 1.1 reads 1e3 as a string, so strings are converted too.
+    try:
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise DatasetError(f"{source}: {name} = {value!r} must be a finite number")
+    return number
+
+
+def _numbers(value: Any, name: str, source: str) -> tuple[float, ...]:
+    if not isinstance(value, (list, tuple)):
+        raise DatasetError(f"{source}: {name} = {value!r} must be a list of numbers")
+    return tuple(_number(item, name, source) for item in value)
+
+
+def _whole(value: float, name: str, source: str) -> int:
+    if value != int(value):
+        raise DatasetError(f"{source}: {name} = {value:g} must be a whole number of pixels")
+    return int(value)

@@ -1,0 +1,108 @@
+"""Reading image files, with errors that name the file."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from warpslam.errors import DatasetError, MissingDependencyError
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+def natural_key(path: Path) -> list[tuple[int, str]]:
+    """Sort key that orders names as people do: frame2 before frame10."""
+    parts = re.split(r"(\d+)", path.name)
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in parts]
+
+
+def list_images(folder: Path, pattern: str = "*", suffixes: tuple[str, ...] = IMAGE_SUFFIXES) -> list[Path]:
+    """Images of ``folder`` in natural order.
+
+    Raises:
+        DatasetError: If the folder is missing or holds no such image.
+    """
+    if not folder.is_dir():
+        raise DatasetError(f"{folder}: no such folder; the sequence is incomplete or of another format")
+    # Files that start with a dot are thumbnails and resource forks, not frames.
+    files = [file for file in folder.glob(pattern) if file.suffix.lower() in suffixes and not file.name.startswith(".")]
+    if not files:
+        wanted = " or ".join(pattern + suffix if pattern.endswith("*") else pattern for suffix in suffixes)
+        raise DatasetError(f"{folder}: no images ({wanted}); check that the download is complete and unpacked")
+    return sorted(files, key=natural_key)
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    """Colour image, uint8, shape (H, W, 3), RGB order."""
+    import cv2
+
+    # Orientation tags would turn the image against its depth.
+    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def read_depth(path: Path) -> np.ndarray:
+    """Stored depth values, uint16, shape (H, W)."""
+    import cv2
+
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2 or image.dtype != np.uint16:
+        channels = 1 if image.ndim == 2 else image.shape[2]
+        raise DatasetError(
+            f"{path}: depth image has {channels} channel(s) of {image.dtype}; store depth as a one-channel 16-bit PNG"
+        )
+    return image
+
+
+def read_exr(path: Path, channel: str = "Y") -> np.ndarray:
+    """One channel of an OpenEXR image, float32, shape (H, W).
+
+    Raises:
+        MissingDependencyError: If the package openexr is not installed.
+        DatasetError: If the file can't be read or lacks the channel.
+    """
+    # The wheels of OpenCV are no longer built with OpenEXR.
+    try:
+        import OpenEXR  # type: ignore[import-not-found, unused-ignore]
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"{path}: reading EXR images needs the package openexr; type: pip install openexr"
+        ) from error
+    _read_bytes(path)
+    try:
+        channels = OpenEXR.File(str(path), separate_channels=True).channels()
+        pixels = {name: item.pixels for name, item in channels.items()}
+    except (RuntimeError, ValueError, TypeError, OSError) as error:
+        raise DatasetError(f"{path}: damaged EXR image ({error}); fetch the file again") from error
+    if channel not in pixels or pixels[channel] is None:
+        raise DatasetError(f"{path}: EXR image has no channel {channel} but {', '.join(sorted(pixels))}; is it depth?")
+    return np.asarray(pixels[channel], dtype=np.float32)
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DatasetError(f"{path}: can't be read ({error.strerror}); check that the sequence is complete") from error
+    if not data:
+        raise DatasetError(f"{path}: empty file; fetch it again or remove the frame")
+    return data
+
+
+def _decode(path: Path, flags: int) -> np.ndarray:
+    import cv2
+
+    data = _read_bytes(path)
+    # Some versions of OpenCV return a cut-off file as an image with a grey or black rest.
+    is_cut_png = data.startswith(b"\x89PNG") and b"IEND" not in data[-64:]
+    is_cut_jpeg = data.startswith(b"\xff\xd8") and b"\xff\xd9" not in data[-1024:]
+    try:
+        image = None if is_cut_png or is_cut_jpeg else cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+    except cv2.error:
+        image = None
+    if image is None:
+        state = "truncated" if is_cut_png or is_cut_jpeg else "damaged or not an"
+        raise DatasetError(f"{path}: {state} image ({len(data)} bytes); fetch the file again or remove the frame")
+    return image
