@@ -1,0 +1,25 @@
+"""Synthetic rooms, a ray-cast renderer and RGB-D sequences with exact ground truth."""
+
+from __future__ import annotations
+
+from warpslam.synthetic.contact_sheet import contact_sheet
+from warpslam.synthetic.noise import sensor_noise
+from warpslam.synthetic.render import MeshRenderer, load_mesh
+from warpslam.synthetic.rooms import Room, make_room
+from warpslam.synthetic.sequence import RenderedSequence, SyntheticSequence, write_replica
+from warpslam.synthetic.trajectory import look_at, orbit, room_trajectory
+
+__all__ = [
+    "MeshRenderer",
+    "RenderedSequence",
+    "Room",
+    "SyntheticSequence",
+    "contact_sheet",
+    "load_mesh",
+    "look_at",
+    "make_room",
+    "orbit",
+    "room_trajectory",
+    "sensor_noise",
+    "write_replica",
+]
