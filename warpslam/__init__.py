@@ -1,0 +1,73 @@
+"""Dense RGB-D SLAM with a neural implicit map (NICE-SLAM), in NVIDIA Warp.
+
+The names below are the public interface. Each is imported on first use, so that ``import warpslam`` loads neither torch
+nor Warp.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from warpslam.camera import Intrinsics as Intrinsics
+    from warpslam.config import PRESETS as PRESETS
+    from warpslam.config import Config as Config
+    from warpslam.decoders import Decoders as Decoders
+    from warpslam.decoders import load_decoders as load_decoders
+    from warpslam.errors import CheckpointError as CheckpointError
+    from warpslam.errors import ConfigError as ConfigError
+    from warpslam.errors import DatasetError as DatasetError
+    from warpslam.errors import InputError as InputError
+    from warpslam.errors import MeshError as MeshError
+    from warpslam.errors import MissingDependencyError as MissingDependencyError
+    from warpslam.errors import WarpSlamError as WarpSlamError
+    from warpslam.evaluation import ate as ate
+    from warpslam.evaluation import rpe as rpe
+    from warpslam.sequences import open_sequence as open_sequence
+    from warpslam.sequences.base import Frame as Frame
+    from warpslam.sequences.base import RgbdSequence as RgbdSequence
+    from warpslam.slam import FrameResult as FrameResult
+    from warpslam.slam import RenderedImage as RenderedImage
+    from warpslam.slam import Slam as Slam
+    from warpslam.slam import Trajectory as Trajectory
+
+_MODULE_OF = {
+    "CheckpointError": "warpslam.errors",
+    "Config": "warpslam.config",
+    "ConfigError": "warpslam.errors",
+    "DatasetError": "warpslam.errors",
+    "Decoders": "warpslam.decoders",
+    "Frame": "warpslam.sequences.base",
+    "FrameResult": "warpslam.slam",
+    "InputError": "warpslam.errors",
+    "Intrinsics": "warpslam.camera",
+    "MeshError": "warpslam.errors",
+    "MissingDependencyError": "warpslam.errors",
+    "PRESETS": "warpslam.config",
+    "RenderedImage": "warpslam.slam",
+    "RgbdSequence": "warpslam.sequences.base",
+    "Slam": "warpslam.slam",
+    "Trajectory": "warpslam.slam",
+    "WarpSlamError": "warpslam.errors",
+    "ate": "warpslam.evaluation",
+    "load_decoders": "warpslam.decoders",
+    "open_sequence": "warpslam.sequences",
+    "rpe": "warpslam.evaluation",
+}
+
+__all__ = [*_MODULE_OF, "__version__"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module 'warpslam' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_MODULE_OF[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

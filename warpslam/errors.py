@@ -1,0 +1,29 @@
+"""Typed errors. Every message names the file or field at fault and says what to do."""
+
+
+class WarpSlamError(Exception):
+    """Base of every error that warpslam raises on purpose."""
+
+
+class ConfigError(WarpSlamError, ValueError):
+    """A setting that can't work: names the field, the value and the accepted range."""
+
+
+class DatasetError(WarpSlamError):
+    """A sequence folder or one of its files can't be used."""
+
+
+class CheckpointError(WarpSlamError):
+    """A decoder or map file is missing, damaged, or does not fit."""
+
+
+class InputError(WarpSlamError, ValueError):
+    """An argument of the Python API has the wrong shape, type or range."""
+
+
+class MeshError(WarpSlamError):
+    """There is no surface to extract, or a mesh file can't be used."""
+
+
+class MissingDependencyError(WarpSlamError, ImportError):
+    """An optional package or a system library it needs can't be loaded."""

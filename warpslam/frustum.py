@@ -1,0 +1,53 @@
+"""Frustum feature selection (A.1): the grid vertices that one frame may change."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from warpslam.camera import Intrinsics
+from warpslam.kernels import frustum
+from warpslam.kernels.grid import Lattice
+
+
+def select_in_frustum(
+    lattice: Lattice,
+    shape: tuple[int, int, int],
+    camera: Intrinsics,
+    T_world_camera: np.ndarray,
+    depth: wp.array,
+    margin: float,
+) -> np.ndarray:
+    """Mask of the vertices in the frustum, bool (rows,).
+
+    Args:
+        lattice: Lattice of the level; ``shape`` its vertices per axis.
+        camera: Intrinsics of the depth image.
+        T_world_camera: Pose of the frame (4, 4).
+        depth: Depth image on the device [m], float32 (H, W).
+        margin: Reach behind the surface and around the camera [m].
+    """
+    device = depth.device
+    rows = int(np.prod(shape))
+    looked_up = wp.empty(rows, dtype=float, device=device)
+    vertex_depth = wp.empty(rows, dtype=float, device=device)
+    max_depth = wp.zeros(1, dtype=float, device=device)
+    selected = wp.empty(rows, dtype=wp.uint8, device=device)
+    T_camera_world = wp.mat44(np.linalg.inv(T_world_camera).astype(np.float32))
+    wp.launch(
+        frustum.project_vertices,
+        dim=shape,
+        inputs=[lattice, T_camera_world, wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy), depth],
+        outputs=[looked_up, vertex_depth, max_depth],
+        device=device,
+        record_tape=False,
+    )
+    wp.launch(
+        frustum.select_vertices,
+        dim=shape,
+        inputs=[lattice, wp.vec3(*T_world_camera[:3, 3]), margin, looked_up, vertex_depth, max_depth],
+        outputs=[selected],
+        device=device,
+        record_tape=False,
+    )
+    return selected.numpy() != 0

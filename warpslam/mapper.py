@@ -1,0 +1,289 @@
+"""Mapping (Sec. 3.3): staged optimisation of the grids over a window of frames, Eq. 8-10, with local bundle
+adjustment.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import warp as wp
+
+from warpslam.camera import Intrinsics, pose_from_vector, vector_from_pose
+from warpslam.config import MappingConfig, SamplingConfig
+from warpslam.field import Gradients, RayBatch
+from warpslam.frustum import select_in_frustum
+from warpslam.keyframes import ImagePool, Keyframe, overlap_fractions
+from warpslam.optimizers import ColorDecoderOptimizer, GridOptimizer, PoseOptimizer
+from warpslam.scene import LEVELS, SceneMap
+from warpslam.tracker import ray_seed
+
+# What each stage optimises, and at which of the configured rates (SPEC of the released code, learning rates by stage).
+_STAGE_LEVELS = {
+    "coarse": ("coarse",),
+    "middle": ("middle",),
+    "fine": ("middle", "fine"),
+    "color": ("middle", "fine", "color"),
+}
+
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass
+class MappingResult:
+    """Outcome of one mapping call.
+
+    vector: Pose vector of the current frame, refined if bundle adjustment ran.
+    losses: Mean loss per kept ray in the last iteration of each stage.
+    window: Frame numbers of the keyframes that took part.
+    adjusted: Whether poses were refined.
+    """
+
+    vector: np.ndarray
+    losses: dict[str, float] = field(default_factory=dict)
+    window: list[int] = field(default_factory=list)
+    adjusted: bool = False
+
+
+class Mapper:
+    """Optimises a `SceneMap` from the current frame and selected keyframes."""
+
+    def __init__(
+        self,
+        scene: SceneMap,
+        camera: Intrinsics,
+        config: MappingConfig,
+        sampling: SamplingConfig,
+        device: wp.Device,
+        seed: int,
+    ) -> None:
+        self.scene, self.camera, self.config, self.sampling = scene, camera, config, sampling
+        self.device, self.seed = device, seed
+        self._grids = {level: GridOptimizer(device) for level in LEVELS}
+        self._decoder = ColorDecoderOptimizer(device)
+        self._poses = PoseOptimizer(2 * config.window + 2, device)
+        self._batch = RayBatch(config.pixels, sampling.stratified + sampling.surface, device)
+
+    def map_first(
+        self, images: ImagePool, frame: int, vector: np.ndarray, on_iteration: Callable | None = None
+    ) -> MappingResult:
+        """The first frame: many iterations at higher rates."""
+        config = self.config
+        return self._optimize(
+            images, frame, vector, [], config.first_iterations, config.first_rate_factor, on_iteration=on_iteration
+        )
+
+    def map_frame(self, images: ImagePool, frame: int, vector: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
+        """A later frame: window, frustum selection, three stages, bundle adjustment once there are enough keyframes."""
+        return self._optimize(images, frame, vector, keyframes, self.config.iterations, 1.0)
+
+    def refine(self, images: ImagePool, frame: int, vector: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
+        """Final colour refinement: a doubled window, all vertices, colour stage only, colour decoder fixed, several
+        rounds.
+        """
+        result = MappingResult(vector)
+        for round_ in range(self.config.refinement_rounds):
+            result = self._optimize(
+                images, frame, result.vector, keyframes, self.config.iterations, 1.0, refinement=True, round_=round_
+            )
+        return result
+
+    # -- one call ------------------------------------------------------------------------------------------------
+
+    def _optimize(
+        self,
+        images: ImagePool,
+        frame: int,
+        vector: np.ndarray,
+        keyframes: list[Keyframe],
+        iterations: int,
+        rate_factor: float,
+        *,
+        refinement: bool = False,
+        round_: int = 0,
+        on_iteration: Callable | None = None,
+    ) -> MappingResult:
+        config = self.config
+        rng = np.random.default_rng([self.seed, 2, frame, round_])
+        size = config.window * (2 if refinement else 1)
+        window = self._choose_window(images, vector, keyframes, size, rng)
+        adjust = (
+            config.bundle_adjustment
+            and config.bundle_adjustment_rate > 0
+            and len(keyframes) >= config.bundle_adjustment_keyframes
+        )
+        # The oldest keyframe holds the window in place: it comes first, and its pose stays.
+        window.sort(key=lambda keyframe: keyframe.index)
+        self._poses.begin(np.stack([*(keyframe.pose for keyframe in window), vector]))
+        slots = wp.array([*(keyframe.slot for keyframe in window), 0], dtype=int, device=self.device)
+        self._select(images, vector, everything=refinement)
+        result = MappingResult(vector, window=[keyframe.index for keyframe in window], adjusted=adjust)
+
+        if config.coarse and not refinement:
+            coarse_slots, coarse_poses = self._coarse_window(keyframes, vector, rng)
+            count = config.first_iterations if not keyframes and rate_factor != 1.0 else config.coarse_iterations
+            self._run_coarse(images, frame, coarse_slots, coarse_poses, count, rate_factor, result)
+
+        stages = self._schedule(iterations, refinement)
+        for iteration, stage in enumerate(stages):
+            self._iterate(images, frame, slots, stage, iteration, rate_factor, adjust, refinement, round_)
+            last_of_stage = iteration + 1 == len(stages) or stages[iteration + 1] != stage
+            if last_of_stage:
+                result.losses[stage] = self._mean_loss()
+            if on_iteration is not None:
+                on_iteration(stage, iteration, len(stages))
+        for name, optimizer in (*self._grids.items(), ("colour decoder", self._decoder)):
+            if optimizer.has_rejected:
+                _log.warning("frame %d: gradients of the %s were not finite and have been left out", frame, name)
+        if adjust:
+            vectors = self._poses.vectors()
+            for keyframe, refined in zip(window[1:], vectors[1:-1], strict=True):
+                keyframe.pose = _normalized(refined)
+            result.vector = _normalized(vectors[-1])
+        return result
+
+    def _schedule(self, iterations: int, refinement: bool) -> list[str]:
+        """Stage of each iteration; both comparisons are inclusive, as in the released code."""
+        if refinement:
+            return ["color"] * iterations
+        middle, fine = int(self.config.middle_share * iterations), int(self.config.fine_share * iterations)
+        return ["middle" if j <= middle else "fine" if j <= fine else "color" for j in range(iterations)]
+
+    def _choose_window(
+        self, images: ImagePool, vector: np.ndarray, keyframes: list[Keyframe], size: int, rng: np.random.Generator
+    ) -> list[Keyframe]:
+        """Up to ``size`` - 2 keyframes that see what the current frame sees (or random ones), and the last keyframe."""
+        if not keyframes or size < 2:
+            return []
+        *candidates, last = keyframes
+        if self.config.selection == "overlap" and candidates:
+            fractions = overlap_fractions(
+                images.depth_image(0),
+                pose_from_vector(vector),
+                [pose_from_vector(keyframe.pose) for keyframe in candidates],
+                self.camera,
+                rng,
+            )
+            candidates = [keyframe for keyframe, fraction in zip(candidates, fractions, strict=True) if fraction > 0]
+        order = rng.permutation(len(candidates))[: max(size - 2, 0)]
+        return [*(candidates[n] for n in order), last]
+
+    def _select(self, images: ImagePool, vector: np.ndarray, *, everything: bool) -> None:
+        """Which vertices of each level may change during this call."""
+        depth = wp.array(images.depth_image(0), dtype=float, device=self.device)
+        T_world_camera = pose_from_vector(vector)
+        for level, optimizer in self._grids.items():
+            grid = self.scene.grids[level]
+            if level == "coarse" or everything or not self.config.frustum_selection:
+                mask = np.ones(grid.row_count, bool)
+            else:
+                mask = select_in_frustum(
+                    grid.lattice, grid.shape, self.camera, T_world_camera, depth, self.config.frustum_margin
+                )
+            optimizer.begin(grid, mask)
+        self._decoder.begin()
+
+    def _iterate(
+        self,
+        images: ImagePool,
+        frame: int,
+        slots: wp.array,
+        stage: str,
+        iteration: int,
+        rate_factor: float,
+        adjust: bool,
+        refinement: bool,
+        round_: int,
+    ) -> None:
+        config, batch, arrays = self.config, self._batch, self.scene.arrays()
+        color = stage == "color"
+        train_decoder = color and config.train_color_decoder and not refinement
+        gradients = Gradients(
+            grids={level: self._grids[level].wanted() for level in _STAGE_LEVELS[stage]},
+            points=adjust and color,
+            color_weights=self._decoder.gradient if train_decoder else None,
+        )
+        seed = ray_seed(self.seed, 3, frame, iteration, round_)
+        with wp.Tape() as tape:
+            batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera, seed=seed)
+            batch.cast(self._poses.poses)
+            batch.bound(arrays)
+            batch.place_samples(self.sampling.stratified, self.sampling.surface, jitter=self.sampling.jitter, seed=seed)
+            scale = 1.0 / batch.count if config.loss == "mean" else 1.0
+            sampling = self.sampling
+            batch.render(
+                arrays,
+                stage,
+                gradients,
+                tape,
+                min_weight=sampling.min_weight,
+                min_gradient=sampling.min_gradient * scale,
+            )
+            batch.mapping_loss(config.color_weight * scale if color else 0.0, scale)
+        tape.backward(batch.loss)
+        rates = {
+            "middle": config.middle_rate if stage == "middle" else config.geometry_rate,
+            "fine": config.geometry_rate,
+            "color": config.color_rate,
+        }
+        for level in _STAGE_LEVELS[stage]:
+            self._grids[level].update(self.scene.grids[level].features, rates[level] * rate_factor)
+        if train_decoder:
+            self._decoder.update_decoder(self.scene.decoders["color"], config.color_rate * rate_factor)
+        if adjust and color:
+            # Moments start in the colour stage: the earlier stages never ask for pose gradients.
+            self._poses.update(config.bundle_adjustment_rate, config.bundle_adjustment_rate, first=1)
+
+    # -- the coarse level (Sec. 3.1; in the released code it serves forecasts only) -------------------------------
+
+    def _coarse_window(
+        self, keyframes: list[Keyframe], vector: np.ndarray, rng: np.random.Generator
+    ) -> tuple[wp.array, wp.array]:
+        """Random keyframes from all but the last, the last one, and the current frame."""
+        chosen: list[Keyframe] = []
+        if keyframes:
+            *others, last = keyframes
+            chosen = [others[n] for n in rng.permutation(len(others))[: max(self.config.window - 2, 0)]] + [last]
+        poses = np.stack([*(keyframe.pose for keyframe in chosen), vector]).astype(np.float32)
+        slots = [*(keyframe.slot for keyframe in chosen), 0]
+        return wp.array(slots, dtype=int, device=self.device), wp.array(poses, dtype=float, device=self.device)
+
+    def _run_coarse(
+        self,
+        images: ImagePool,
+        frame: int,
+        slots: wp.array,
+        poses: wp.array,
+        iterations: int,
+        rate_factor: float,
+        result: MappingResult,
+    ) -> None:
+        """Coarse stage: no depth guidance, depth loss only, all vertices."""
+        config, batch, arrays = self.config, self._batch, self.scene.arrays()
+        optimizer = self._grids["coarse"]
+        gradients = Gradients(grids={"coarse": optimizer.wanted()})
+        for iteration in range(iterations):
+            seed = ray_seed(self.seed, 4, frame, iteration)
+            with wp.Tape() as tape:
+                batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera, seed=seed)
+                batch.cast(poses)
+                batch.bound(arrays, use_depth=False)
+                batch.place_samples(
+                    self.sampling.stratified, 0, use_depth=False, jitter=self.sampling.jitter, seed=seed
+                )
+                batch.render(arrays, "coarse", gradients, tape)
+                batch.mapping_loss(0.0, 1.0 / batch.count if config.loss == "mean" else 1.0)
+            tape.backward(batch.loss)
+            optimizer.update(self.scene.grids["coarse"].features, config.coarse_rate * rate_factor)
+        result.losses["coarse"] = self._mean_loss()
+
+    def _mean_loss(self) -> float:
+        return float(self._batch.loss.numpy()[0]) / max(self._batch.count, 1)
+
+
+def _normalized(vector: np.ndarray) -> np.ndarray:
+    """Pose vector with a unit quaternion: Adam moves its length freely, which changes nothing but the step sizes."""
+    return vector_from_pose(pose_from_vector(vector))

@@ -1,0 +1,188 @@
+"""The folder that a run leaves behind, and where in it everything lies."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from warpslam.errors import ConfigError, DatasetError
+
+# Removed before a run writes into a folder that an earlier run used: a stale mesh beside a new trajectory misleads.
+_WRITTEN_FILES = (
+    "config.yaml",
+    "error_over_time.png",
+    "ground_truth.tum",
+    "input.json",
+    "log.txt",
+    "map.npz",
+    "mesh.ply",
+    "metrics.json",
+    "panels.png",
+    "timing.json",
+    "trajectory.tum",
+    "trajectory_top_view.png",
+)
+
+
+@dataclass(frozen=True)
+class Source:
+    """How to open the sequence of a run again.
+
+    path: Folder of the sequence; None for the built-in demo sequence.
+    dataset: Format, as `warpslam.sequences.open_sequence` takes it.
+    camera: Camera given by hand, "fx,fy,cx,cy,width,height,depth_scale"; None for the dataset's own.
+    """
+
+    path: str | None
+    dataset: str = "auto"
+    camera: str | None = None
+
+
+class RunFolder:
+    """Paths of one run.
+
+    ``config`` effective settings, ``trajectory`` and ``ground_truth`` in TUM format, ``mesh``, ``map`` for later
+    rendering, ``metrics``, ``timing``, ``source`` (how to open the input again), ``log``, and the plots.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.config = self.path / "config.yaml"
+        self.trajectory = self.path / "trajectory.tum"
+        self.ground_truth = self.path / "ground_truth.tum"
+        self.mesh = self.path / "mesh.ply"
+        self.map = self.path / "map.npz"
+        self.metrics = self.path / "metrics.json"
+        self.timing = self.path / "timing.json"
+        self.source = self.path / "input.json"
+        self.log = self.path / "log.txt"
+        self.top_view = self.path / "trajectory_top_view.png"
+        self.error_plot = self.path / "error_over_time.png"
+        self.panels = self.path / "panels.png"
+
+    @classmethod
+    def create(cls, path: str | Path | None, name: str, root: str | Path = "runs") -> RunFolder:
+        """Make the folder of a new run.
+
+        Args:
+            path: Folder to write to; what an earlier run wrote there is removed. None makes ``root/name/<time>`` and
+                points ``root/name/latest`` at it.
+            name: Name of the sequence.
+            root: Folder of all runs.
+
+        Raises:
+            ConfigError: The folder can't be made.
+        """
+        folder = Path(path) if path is not None else _free_name(Path(root) / _as_file_name(name))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if (folder / "metrics.json").exists():
+                for file in _WRITTEN_FILES:
+                    (folder / file).unlink(missing_ok=True)
+        except OSError as error:
+            raise ConfigError(f"output folder {folder} can't be used ({error.strerror}); choose another one") from error
+        if path is None:
+            _point_latest(folder)
+        return cls(folder)
+
+    @classmethod
+    def open(cls, path: str | Path) -> RunFolder:
+        """The folder of an earlier run.
+
+        Raises:
+            DatasetError: There is no run in ``path``.
+        """
+        folder = cls(path)
+        if not folder.metrics.is_file():
+            raise DatasetError(f"{path} is no run folder: it has no metrics.json; pass what 'warpslam run -o' wrote")
+        return folder
+
+    def require(self, file: Path, remedy: str) -> Path:
+        """Return ``file``, or raise `DatasetError` with ``remedy`` if the run did not write it."""
+        if not file.is_file():
+            raise DatasetError(f"{self.path} has no {file.name}; {remedy}")
+        return file
+
+    def write_source(self, source: Source) -> None:
+        """Record how to open the input again."""
+        write_json(self.source, asdict(source))
+
+    def read_source(self) -> Source:
+        """How to open the input again.
+
+        Raises:
+            DatasetError: The run did not record it, or the file is damaged.
+        """
+        self.require(self.source, "so its input frames are unknown")
+        fields = read_json(self.source)
+        try:
+            return Source(**fields)
+        except TypeError as error:
+            raise DatasetError(f"{self.source}: expected the fields path, dataset and camera ({error})") from error
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write `to_json` of a value; the file is replaced only once all is written."""
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(to_json(value) + "\n", encoding="utf-8")
+    os.replace(partial, path)
+
+
+def to_json(value: Any) -> str:
+    """JSON text that every parser reads: NaN and infinity become null, arrays become lists."""
+    return json.dumps(_plain(value), indent=2, allow_nan=False)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object.
+
+    Raises:
+        DatasetError: The file can't be read or holds something else.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{path}: can't be read as JSON ({error}); run again to write it anew") from error
+    if not isinstance(value, dict):
+        raise DatasetError(f"{path}: expected a JSON object, found {type(value).__name__}")
+    return value
+
+
+def _plain(value: Any) -> Any:
+    """``value`` with NumPy numbers and arrays, paths and non-finite floats replaced by what JSON knows."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
+
+
+def _as_file_name(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name).strip(".") or "run"
+
+
+def _free_name(parent: Path) -> Path:
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    folder, number = parent / stamp, 1
+    while folder.exists():
+        number += 1
+        folder = parent / f"{stamp}_{number}"
+    return folder
+
+
+def _point_latest(folder: Path) -> None:
+    """Make ``latest`` beside ``folder`` lead to it. Only a convenience: some file systems have no symbolic links."""
+    link = folder.parent / "latest"
+    with contextlib.suppress(OSError):
+        link.unlink(missing_ok=True)
+        link.symlink_to(folder.name, target_is_directory=True)
