@@ -1,0 +1,56 @@
+"""Render views that a run never saw from its map, and compare them with the sequence's own images and true poses.
+
+Example, for a run over the even frames: python tools/evaluate_views.py runs/house/latest house --frames 13:240:24
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from warpslam.cli import parse_frames
+from warpslam.errors import WarpSlamError
+from warpslam.sequences import open_sequence
+from warpslam.slam import Slam
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="run folder")
+    parser.add_argument("sequence", help="sequence folder with true poses")
+    parser.add_argument("--frames", type=parse_frames, default=slice(None), help="a:b:step, frames to render")
+    parser.add_argument("--stride", type=int, default=2, help="render every n-th pixel")
+    options = parser.parse_args(arguments)
+    try:
+        slam, sequence = Slam.load(options.run / "map.npz"), open_sequence(options.sequence)
+    except WarpSlamError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    stride = options.stride
+    rows = []
+    print("|rendered - true depth| [cm] and PSNR [dB]; samples placed by the true depth, then by the map alone")
+    print("frame    mean  median   PSNR  |  mean  median   PSNR")
+    for index in range(len(sequence))[options.frames]:
+        frame = sequence[index]
+        depth, rgb = frame.depth[::stride, ::stride], frame.rgb[::stride, ::stride] / 255.0
+        valid = depth > 0
+        row = []
+        for guide in (frame.depth, None):
+            image = slam.render(frame.T_world_camera, depth=guide, stride=stride)
+            error = 100 * np.abs(image.depth - depth)[valid]
+            row += [error.mean(), np.median(error), -10 * np.log10(np.mean((image.rgb - rgb) ** 2))]
+        rows.append(row)
+        print(f"{index:5d}  {_text(row)}", flush=True)
+    print(f" mean  {_text(np.mean(rows, axis=0))}")
+    return 0
+
+
+def _text(row) -> str:
+    return "{:6.2f}  {:6.2f}  {:5.1f}  |{:6.2f}  {:6.2f}  {:5.1f}".format(*row)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
