@@ -1,0 +1,31 @@
+"""Fixtures that more than one test folder uses."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+def _shared_path(variable: str, default: str) -> Path:
+    """Path named by an environment variable, else ``default`` beside the repository; skips if it isn't there."""
+    path = Path(os.environ[variable]) if variable in os.environ else REPOSITORY.parent / "shared" / default
+    if not path.exists():
+        pytest.skip(f"no test data at {path}: set {variable} to where it is")
+    return path
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """Folder with the test sequences, one folder each."""
+    return _shared_path("WARPSLAM_DATA", "data")
+
+
+@pytest.fixture(scope="session")
+def golden() -> np.lib.npyio.NpzFile:
+    """Reference vectors: inputs and outputs of the authors' implementation on a small scene."""
+    return np.load(_shared_path("WARPSLAM_GOLDEN", "golden/reference_vectors.npz"))

@@ -1,0 +1,136 @@
+"""A sequence and a SLAM object that answer at once, for tests of everything around the core."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from warpslam.camera import Intrinsics, pose_from_vector
+from warpslam.errors import DatasetError, MeshError
+from warpslam.sequences.base import Frame, RgbdSequence
+
+CAMERA = Intrinsics(20, 20, 15.5, 11.5, 32, 24)
+
+
+def true_pose(index: int) -> np.ndarray:
+    """A camera walking on an arc."""
+    a = 0.02 * index
+    return pose_from_vector(np.array([np.cos(a), 0, np.sin(a), 0, 0.1 * index, 0.01 * index**2, 0.2]))
+
+
+class FakeSequence(RgbdSequence):
+    """A wall 2 m in front of the camera; chosen frames can't be read or have no truth."""
+
+    name = "fake sequence"
+    intrinsics = CAMERA
+    preset = "default"
+
+    def __init__(self, count: int = 8, *, unreadable: tuple[int, ...] = (), no_truth: tuple[int, ...] = ()) -> None:
+        self.count, self.unreadable, self.no_truth = count, unreadable, no_truth
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> Frame:
+        if index in self.unreadable:
+            raise DatasetError(f"frame{index:06d}.jpg is truncated")
+        rgb = np.full((CAMERA.height, CAMERA.width, 3), 40 + index, dtype=np.uint8)
+        depth = np.full((CAMERA.height, CAMERA.width), 2.0, dtype=np.float32)
+        depth[:2] = 0
+        return Frame(index, index / 30, rgb, depth, None if index in self.no_truth else true_pose(index))
+
+
+@dataclass
+class FakeResult:
+    index: int
+    timestamp: float
+    T_world_camera: np.ndarray
+    status: str = "OK"
+    losses: dict[str, float] = field(default_factory=lambda: {"loss": 1.5})
+    inliers: float = 0.9
+    timings: dict[str, float] = field(default_factory=lambda: {"tracking": 0.25, "mapping": 0.5})
+    message: str = ""
+
+
+@dataclass
+class FakeTrajectory:
+    timestamps: np.ndarray
+    poses: np.ndarray
+    status: list[str]
+
+
+@dataclass
+class FakeImage:
+    depth: np.ndarray
+    rgb: np.ndarray
+    variance: np.ndarray
+
+
+class FakeSlam:
+    """Returns the given pose 1 cm off in x in every other frame; what it should do wrong is set on the class."""
+
+    interrupt_at: int | None = None
+    fail_at: int | None = None
+    lost_at: int | None = None
+    mesh_fails = False
+    compile_seconds = 0.25
+    device = "cpu"
+
+    def __init__(self, intrinsics: Intrinsics, **settings: object) -> None:
+        self.settings = settings
+        self.results: list[FakeResult] = []
+        self.given: list[np.ndarray | None] = []
+        self.finished = False
+
+    def step(self, rgb, depth, timestamp=None, T_world_camera=None) -> FakeResult:
+        index = len(self.results)
+        if index == self.interrupt_at:
+            raise KeyboardInterrupt
+        if index == self.fail_at:
+            raise RuntimeError("out of memory")
+        assert rgb.dtype == np.uint8 and depth.dtype == np.float32
+        self.given.append(T_world_camera)
+        T = np.array(true_pose(round(timestamp * 30)))
+        T[0, 3] += 0.01 * (index % 2)
+        self.results.append(FakeResult(index, timestamp, T, "LOST" if index == self.lost_at else "OK"))
+        return self.results[-1]
+
+    def finish(self) -> dict[str, float]:
+        self.finished = True
+        return {"refinement": 0.5}
+
+    @property
+    def trajectory(self) -> FakeTrajectory:
+        return FakeTrajectory(
+            np.array([r.timestamp for r in self.results]),
+            np.array([r.T_world_camera for r in self.results]).reshape(-1, 4, 4),
+            [r.status for r in self.results],
+        )
+
+    def render(self, T_world_camera: np.ndarray, stride: int = 1) -> FakeImage:
+        shape = (-(-CAMERA.height // stride), -(-CAMERA.width // stride))
+        return FakeImage(np.full(shape, 2.03, np.float32), np.full((*shape, 3), 0.2, np.float32), np.zeros(shape))
+
+    def mesh(self, voxel: float = 0.02) -> trimesh.Trimesh:
+        if self.mesh_fails:
+            raise MeshError("the map has no surface")
+        mesh = wall()
+        mesh.visual.vertex_colors = np.tile(np.uint8([10, 20, 30, 255]), (len(mesh.vertices), 1))
+        return mesh
+
+    def save(self, path: Path) -> None:
+        Path(path).write_bytes(b"fake map")
+
+    @classmethod
+    def load(cls, path: Path, device: str | None = None) -> FakeSlam:
+        assert Path(path).read_bytes() == b"fake map"
+        return cls(CAMERA)
+
+
+def wall() -> trimesh.Trimesh:
+    """The wall that the first camera sees."""
+    corners = np.array([[-3, -3, 2.2], [3, -3, 2.2], [3, 3, 2.2], [-3, 3, 2.2]])
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)

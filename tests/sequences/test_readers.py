@@ -1,0 +1,281 @@
+"""Each reader on a tiny sequence of its format: frames, depth and poses are compared with what was written."""
+
+from __future__ import annotations
+
+import builtins
+import json
+
+import numpy as np
+import pytest
+
+from tests.sequences import writers
+from warpslam.camera import Intrinsics
+from warpslam.errors import MissingDependencyError
+from warpslam.sequences import open_sequence
+
+TINY = Intrinsics(20, 21, 11.5, 7.5, writers.WIDTH, writers.HEIGHT)
+
+
+def check_frame(frame, index, source=None, *, scale=1000.0, pose=True):
+    """Compare a frame with the images and the pose of number ``source``."""
+    source = index if source is None else source
+    assert frame.index == index
+    assert frame.rgb.dtype == np.uint8 and frame.depth.dtype == np.float32
+    np.testing.assert_array_equal(frame.rgb, writers.make_rgb(source))
+    np.testing.assert_array_equal(frame.depth, writers.make_depth(source).astype(np.float32) / np.float32(scale))
+    assert frame.depth[0, 0] == 0
+    if pose:
+        np.testing.assert_allclose(frame.T_world_camera, writers.make_pose(source), rtol=0, atol=1e-12)
+    else:
+        assert frame.T_world_camera is None
+
+
+def test_replica(tmp_path):
+    """Replica: natural order, poses as stored, times at 30 Hz, camera.yaml before the built-in camera."""
+    sequence = open_sequence(writers.write_replica(tmp_path / "room", 3))
+    assert (len(sequence), sequence.name, sequence.preset, sequence.intrinsics) == (3, "room", "replica", TINY)
+    for index, frame in enumerate(sequence):
+        check_frame(frame, index)
+        assert frame.timestamp == index / 30
+    truth = sequence.ground_truth()
+    np.testing.assert_allclose(truth, [writers.make_pose(i) for i in range(3)], rtol=0, atol=1e-12)
+    check_frame(sequence[-1], 2)
+    with pytest.raises(IndexError):
+        sequence[3]
+
+
+def test_ground_truth_is_a_copy(tmp_path):
+    """Changing a returned pose leaves the sequence as it was."""
+    sequence = open_sequence(writers.write_replica(tmp_path))
+    sequence.ground_truth()[:] = 0
+    sequence[1].T_world_camera[:] = 0
+    check_frame(sequence[1], 1)
+
+
+def test_replica_built_in_camera(tmp_path):
+    """Replica without camera.yaml or traj.txt: the published camera and depth unit, no poses."""
+    writers.write_image(tmp_path / "results" / "frame000000.jpg", np.full((680, 1200, 3), 90, np.uint8))
+    depth = np.full((680, 1200), 6554, np.uint16)
+    writers.write_image(tmp_path / "results" / "depth000000.png", depth)
+    sequence = open_sequence(tmp_path)
+    assert sequence.intrinsics == Intrinsics(600, 600, 599.5, 339.5, 1200, 680)
+    assert sequence.ground_truth() is None and sequence[0].T_world_camera is None
+    assert sequence[0].depth[5, 5] == np.float32(6554) / np.float32(6553.5)
+
+
+def test_camera_argument_wins(tmp_path):
+    """The camera string replaces camera.yaml, its depth unit included."""
+    camera = f"30, 31, 12, 8, {writers.WIDTH}, {writers.HEIGHT}, 5e2"
+    sequence = open_sequence(writers.write_replica(tmp_path), camera=camera)
+    assert sequence.intrinsics == Intrinsics(30, 31, 12, 8, writers.WIDTH, writers.HEIGHT)
+    check_frame(sequence[2], 2, scale=500.0)
+
+
+def test_tum_association(tmp_path):
+    """TUM: nearest depth and pose, both within 0.08 s, frames at least 1/32 s apart."""
+    folder = writers.write_tum(
+        tmp_path,
+        times=[10.00, 10.02, 10.10, 10.50, 11.00],
+        depth_times=[9.97, 10.03, 10.13, 11.06],
+        pose_times=[10.01, 10.09, 10.50, 10.93],
+    )
+    sequence = open_sequence(folder, camera=writers.CAMERA)
+    # 10.02 is too close to 10.00; 10.50 has no depth; 11.00 takes depth 11.06 and pose 10.93, both just near enough.
+    assert [frame.timestamp for frame in sequence] == [10.00, 10.10, 11.00]
+    for index, (rgb, depth, pose) in enumerate([(0, 0, 0), (2, 2, 1), (4, 3, 3)]):
+        frame = sequence[index]
+        np.testing.assert_array_equal(frame.rgb, writers.make_rgb(rgb))
+        np.testing.assert_array_equal(frame.depth, writers.make_depth(depth).astype(np.float32) / np.float32(1000))
+        np.testing.assert_allclose(frame.T_world_camera, writers.make_pose(pose), atol=1e-12)
+
+
+def test_tum_limit_of_association(tmp_path):
+    """TUM: 0.09 s to the nearest pose is too much."""
+    folder = writers.write_tum(tmp_path, times=[1.0, 2.0], depth_times=[1.0, 2.0], pose_times=[1.0, 2.09])
+    assert [frame.timestamp for frame in open_sequence(folder, camera=writers.CAMERA)] == [1.0]
+
+
+def test_tum_without_poses(tmp_path):
+    """TUM: without a pose file depth alone decides; pose.txt stands in for groundtruth.txt."""
+    folder = writers.write_tum(tmp_path, times=[1.0, 2.0], depth_times=[1.0, 2.0], pose_times=[1.0])
+    (folder / "groundtruth.txt").rename(folder / "pose.txt")
+    assert len(open_sequence(folder, camera=writers.CAMERA)) == 1
+    (folder / "pose.txt").unlink()
+    sequence = open_sequence(folder, camera=writers.CAMERA)
+    assert len(sequence) == 2 and sequence.ground_truth() is None
+
+
+@pytest.mark.parametrize(
+    ("name", "focal"), [("tum_fr1_xyz", 517.3), ("rgbd_dataset_freiburg2_desk", 520.9), ("fr3_office", 535.4)]
+)
+def test_tum_camera_from_name(tmp_path, name, focal):
+    """TUM: the folder's name tells the camera; frames are resized to 512 x 384 and lose 8 pixels on each side."""
+    folder = writers.write_tum(tmp_path / name, times=[], depth_times=[], pose_times=[1.0])
+    for kind, image in (("rgb", np.zeros((480, 640, 3), np.uint8)), ("depth", np.full((480, 640), 5000, np.uint16))):
+        writers.write_image(folder / kind / "1.png", image)
+        (folder / f"{kind}.txt").write_text(f"1.0 {kind}/1.png\n")
+    sequence = open_sequence(folder)
+    assert (sequence.intrinsics.width, sequence.intrinsics.height) == (496, 368)
+    assert sequence.intrinsics.fx == pytest.approx(focal * 0.8)
+    assert sequence[0].rgb.shape == (368, 496, 3) and sequence[0].depth.shape == (368, 496)
+    assert (sequence[0].depth == 1).all()
+
+
+def test_scannet(tmp_path):
+    """ScanNet: numeric order, colour brought to the size of depth, a pose of -inf is unknown."""
+    sequence = open_sequence(writers.write_scannet(tmp_path), camera=writers.CAMERA)
+    assert (len(sequence), sequence.preset, sequence.intrinsics) == (3, "scannet", TINY)
+    for index, frame in enumerate(sequence):
+        stored = writers.make_depth(index).astype(np.float32) / np.float32(1000)
+        np.testing.assert_array_equal(frame.depth, stored)
+        assert frame.rgb.shape == (writers.HEIGHT, writers.WIDTH, 3)
+        assert abs(int(frame.rgb[8, 8, 0]) - 200) < 8 and abs(int(frame.rgb[8, 8, 1]) - 10 * index) < 8
+    assert sequence[1].T_world_camera is None
+    truth = sequence.ground_truth()
+    assert np.isnan(truth[1]).all()
+    np.testing.assert_allclose(truth[[0, 2]], [writers.make_pose(0), writers.make_pose(2)], atol=1e-12)
+
+
+def test_scannet_crop(tmp_path):
+    """ScanNet's own camera cuts 10 pixels from every side, and the principal point moves along."""
+    depth = np.arange(480 * 640, dtype=np.uint32).reshape(480, 640).astype(np.uint16)
+    writers.write_image(tmp_path / "frames" / "depth" / "0.png", depth)
+    writers.write_image(tmp_path / "frames" / "color" / "0.jpg", np.zeros((968, 1296, 3), np.uint8))
+    sequence = open_sequence(tmp_path)
+    assert sequence.intrinsics == Intrinsics(577.590698, 578.729797, 308.905426, 232.683609, 620, 460)
+    np.testing.assert_array_equal(sequence[0].depth, depth[10:-10, 10:-10].astype(np.float32) / np.float32(1000))
+    assert sequence[0].rgb.shape == (460, 620, 3)
+
+
+def test_seven_scenes(tmp_path):
+    """7-Scenes: 0 and 65535 are missing depth."""
+    sequence = open_sequence(writers.write_seven_scenes(tmp_path), camera=writers.CAMERA)
+    assert (len(sequence), sequence.preset) == (3, "seven_scenes")
+    for index, frame in enumerate(sequence):
+        expected = writers.make_depth(index).astype(np.float32) / np.float32(1000)
+        expected[0, 1] = 0
+        np.testing.assert_array_equal(frame.depth, expected)
+        np.testing.assert_array_equal(frame.rgb, writers.make_rgb(index))
+        np.testing.assert_allclose(frame.T_world_camera, writers.make_pose(index), atol=1e-12)
+
+
+def test_cofusion(tmp_path):
+    """Co-Fusion: metres from EXR; what is too far, infinite or not a number is missing; no poses."""
+    pytest.importorskip("OpenEXR", reason="the package openexr is not installed")
+    camera = writers.CAMERA.replace(",1000", ",1")
+    sequence = open_sequence(writers.write_cofusion(tmp_path), camera=camera)
+    assert (len(sequence), sequence.preset, sequence.ground_truth()) == (2, "cofusion", None)
+    for index, frame in enumerate(sequence):
+        expected = writers.make_depth(index).astype(np.float32) / 1000
+        expected[0, 1:4] = 0
+        assert frame.depth.dtype == np.float32
+        np.testing.assert_array_equal(frame.depth, expected)
+        np.testing.assert_array_equal(frame.rgb, writers.make_rgb(index))
+
+
+def test_cofusion_without_openexr(tmp_path, monkeypatch):
+    """Co-Fusion without the optional package says what to install."""
+    original = builtins.__import__
+
+    def without_openexr(name, *args, **kwargs):
+        if name == "OpenEXR":
+            raise ImportError(name)
+        return original(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without_openexr)
+    with pytest.raises(MissingDependencyError, match="pip install openexr"):
+        open_sequence(writers.write_cofusion(tmp_path), camera=writers.CAMERA)
+
+
+@pytest.mark.parametrize("log", ["scene/trajectory.log", "trajectory.log", "slam.log"])
+def test_azure(tmp_path, log):
+    """Own recording: poses from any of the places of a Redwood log; a frame that it leaves out has none."""
+    folder = writers.write_color_depth(tmp_path, "color")
+    assert open_sequence(folder, camera=writers.CAMERA).ground_truth() is None
+    writers.write_log(folder / log, {0: writers.make_pose(0), 2: writers.make_pose(2)})
+    sequence = open_sequence(folder, camera=writers.CAMERA)
+    assert (len(sequence), sequence.preset) == (3, "apartment")
+    for index in range(3):
+        check_frame(sequence[index], index, pose=index != 1)
+
+
+def test_azure_recorder_camera(tmp_path):
+    """Own recording: the camera of Open3D's intrinsic.json (column-major), which camera.yaml replaces."""
+    folder = writers.write_color_depth(tmp_path, "color")
+    matrix = [20.0, 0, 0, 0, 21.0, 0, 11.5, 7.5, 1]
+    fields = {"width": writers.WIDTH, "height": writers.HEIGHT, "intrinsic_matrix": matrix}
+    (folder / "intrinsic.json").write_text(json.dumps(fields))
+    assert open_sequence(folder).intrinsics == TINY
+    (folder / "camera.yaml").write_text(writers.CAMERA_YAML.replace("fx: 20", "fx: 33"))
+    assert open_sequence(folder).intrinsics.fx == 33
+
+
+def test_redwood(tmp_path):
+    """Redwood: the optimised trajectory comes before the first one."""
+    folder = writers.write_color_depth(tmp_path, "image")
+    writers.write_log(folder / "test_scene/trajectory.log", {i: np.eye(4) for i in range(3)})
+    np.testing.assert_array_equal(
+        open_sequence(folder, camera=writers.CAMERA).ground_truth(), np.stack([np.eye(4)] * 3)
+    )
+    poses = {i: writers.make_pose(i) for i in range(3)}
+    writers.write_log(folder / "test_slac/0.050/optimized_trajectory_slac.log", poses)
+    sequence = open_sequence(folder, camera=writers.CAMERA)
+    assert sequence.preset == "icl"
+    for index, frame in enumerate(sequence):
+        check_frame(frame, index)
+
+
+def test_natural_order(tmp_path):
+    """Frame 10 comes after frame 9, though it sorts before as text."""
+    for i in range(11):
+        writers.write_image(tmp_path / "color" / f"{i}.png", writers.make_rgb(i))
+        writers.write_image(tmp_path / "depth" / f"{i}.png", writers.make_depth(i))
+    sequence = open_sequence(tmp_path, camera=writers.CAMERA)
+    for index in (2, 9, 10):
+        check_frame(sequence[index], index, pose=False)
+
+
+def test_resize_and_crop(tmp_path):
+    """A world point keeps its ray when a camera.yaml asks for resizing and cropping."""
+    width, height = 80, 60
+    fx, fy, cx, cy = 70.0, 72.0, 41.0, 28.0
+    v, u = np.mgrid[:height, :width]
+    # Depth of a plane that is tilted, so that a shift by a part of a pixel shows.
+    normal = np.array([0.3, -0.2, 1.0])
+    depth = 2.0 / (normal[0] * (u - cx) / fx + normal[1] * (v - cy) / fy + normal[2])
+    rgb = np.stack([3 * u, 4 * v, 0 * u], axis=-1).astype(np.uint8)
+    writers.write_image(tmp_path / "results/frame0.png", rgb)
+    writers.write_image(tmp_path / "results/depth0.png", np.rint(depth * 10000).astype(np.uint16))
+    text = f"fx: {fx}\nfy: {fy}\ncx: {cx}\ncy: {cy}\nwidth: {width}\nheight: {height}\ndepth_scale: 1e4\n"
+    (tmp_path / "camera.yaml").write_text(text + "resize: [40, 20]\ncrop: 3\n")
+    sequence = open_sequence(tmp_path)
+    K, frame = sequence.intrinsics, sequence[0]
+    assert (K.fx, K.fy, K.cx, K.width, K.height) == (35.0, 24.0, 17.5, 34, 14)
+    assert K.cy == pytest.approx(28 / 3 - 3)
+    rows, columns = np.mgrid[: K.height, : K.width]
+    rays = normal[0] * (columns - K.cx) / K.fx + normal[1] * (rows - K.cy) / K.fy + normal[2]
+    np.testing.assert_allclose(frame.depth, 2.0 / rays, atol=1e-4)
+    np.testing.assert_allclose(frame.rgb[..., 0], 3 * 2 * (columns + 3), atol=1)
+    np.testing.assert_allclose(frame.rgb[..., 1], 4 * 3 * (rows + 3), atol=1)
+
+
+def test_undistortion_straightens_colour_only(tmp_path):
+    """A distorted colour image is sampled where OpenCV's model puts the pixel; depth is left alone."""
+    width, height = 80, 60
+    f, cx, cy, k1, p1 = 60.0, 39.5, 29.5, 0.2, 0.01
+    v, u = np.mgrid[:height, :width]
+    depth = (u + 100 * v).astype(np.uint16)
+    writers.write_image(tmp_path / "results/frame0.png", np.stack([3 * u, 4 * v, 0 * u], axis=-1).astype(np.uint8))
+    writers.write_image(tmp_path / "results/depth0.png", depth)
+    text = f"fx: {f}\nfy: {f}\ncx: {cx}\ncy: {cy}\nwidth: {width}\nheight: {height}\ndepth_scale: 1000\n"
+    (tmp_path / "camera.yaml").write_text(text + f"distortion: [{k1}, 0, {p1}, 0]\n")
+    frame = open_sequence(tmp_path)[0]
+    np.testing.assert_array_equal(frame.depth, depth.astype(np.float32) / np.float32(1000))
+    x, y = (u - cx) / f, (v - cy) / f
+    r2 = x * x + y * y
+    distorted_u = (x * (1 + k1 * r2) + 2 * p1 * x * y) * f + cx
+    distorted_v = (y * (1 + k1 * r2) + p1 * (r2 + 2 * y * y)) * f + cy
+    inside = (distorted_u > 0) & (distorted_u < width - 1) & (distorted_v > 0) & (distorted_v < height - 1)
+    assert np.abs(distorted_u - u)[inside].max() > 2
+    assert np.abs(frame.rgb[..., 0] - 3 * distorted_u)[inside].max() <= 1
+    assert np.abs(frame.rgb[..., 1] - 4 * distorted_v)[inside].max() <= 1

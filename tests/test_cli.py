@@ -1,0 +1,218 @@
+"""The command line: arguments, what is printed, exit codes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.fakes import FakeSequence, FakeSlam, wall
+from warpslam import cli, demo, pipeline, revisit
+from warpslam.evaluation import read_tum
+from warpslam.run_folder import read_json
+
+
+@pytest.fixture
+def faked(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
+    """Sequences and SLAM that answer at once, behind the real command line; plots are left out."""
+
+    class Slam(FakeSlam):
+        configs: list = []
+
+    def build(intrinsics, config, device, seed):
+        Slam.configs.append(config)
+        return Slam(intrinsics, config=config, device=device, seed=seed)
+
+    monkeypatch.setattr(pipeline, "build_slam", build)
+    monkeypatch.setattr(pipeline._Run, "_draw_plots", lambda self: None)
+    monkeypatch.setattr(revisit, "load_slam", lambda folder, device=None: Slam.load(folder.map, device))
+    monkeypatch.setattr(revisit, "open_source", lambda source: FakeSequence(8, unreadable=(6,)))
+    return Slam
+
+
+def test_run_prints_progress_and_summary(faked, tmp_path, capsys):
+    """Plain lines where there is no terminal, then the figures and where everything lies; warnings on stderr."""
+    assert cli.main(["run", "seq", "--frames", "0:7", "--seed", "5", "-o", str(tmp_path / "out")]) == 0
+    out, err = capsys.readouterr()
+    assert "frame 1/7" in out and "frame 7/7" not in out  # frame 6 can't be read
+    metrics = read_json(tmp_path / "out" / "metrics.json")
+    errors = [f"{100 * metrics['ate_m'][how]['rmse']:.2f} cm {how}" for how in ("aligned", "unaligned")]
+    assert f"ATE RMSE    {', '.join(errors)}" in out and "6 of 7 (6 OK, 1 unreadable), finished" in out
+    assert f"written to  {tmp_path / 'out'}" in out
+    assert "WARNING: frame 6 left out" in err
+    assert metrics["seed"] == 5
+
+
+def test_run_passes_settings_on(faked, tmp_path):
+    """Preset, overrides and the decoder file reach the configuration that is used and written."""
+    arguments = ["run", "seq", "--preset", "paper_scannet", "--set", "mapping.window=3", "tracking.iterations=7"]
+    arguments += ["--set", "mapping.every=2", "--decoders", "some.pth", "-o", str(tmp_path)]
+    assert cli.main(arguments) == 0
+    config = faked.configs[-1]
+    assert (config.mapping.window, config.tracking.iterations, config.mapping.every) == (3, 7, 2)
+    assert (config.tracking.pixels, config.decoders) == (1000, "some.pth")
+    assert "decoders: some.pth" in (tmp_path / "config.yaml").read_text()
+
+
+def test_run_records_how_to_open_the_input_again(faked, tmp_path):
+    """The folder is kept as an absolute path, with the format and camera given."""
+    cli.main(["run", "seq", "--dataset", "icl", "--camera", "1,1,1,1,2,2,1000", "-o", str(tmp_path)])
+    source = read_json(tmp_path / "input.json")
+    assert source["path"].startswith("/") and source["path"].endswith("seq")
+    assert (source["dataset"], source["camera"]) == ("icl", "1,1,1,1,2,2,1000")
+
+
+def test_interrupted_run_exits_130_with_partial_results(faked, tmp_path, monkeypatch):
+    """Ctrl-C ends in the usual exit code and a run folder that can be used."""
+    monkeypatch.setattr(faked, "interrupt_at", 3)
+    assert cli.main(["run", "seq", "-o", str(tmp_path)]) == 130
+    assert len(read_tum(tmp_path / "trajectory.tum")[0]) == 3
+    assert cli.main(["eval", str(tmp_path)]) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run", "/no/such/folder"], "/no/such/folder"),
+        (["eval", "/no/such/run"], "/no/such/run"),
+        (["render", "/no/such/run", "--frame", "0"], "/no/such/run"),
+        (["mesh", "/no/such/run"], "/no/such/run"),
+        (["demo", "--set", "mapping.windw=3"], "mapping.windw"),
+        (["demo", "--set", "mapping"], "mapping"),
+        (["demo", "--device", "cuda:77"], "cuda:77"),
+    ],
+)
+def test_errors_are_one_line_and_exit_2(arguments, message, tmp_path, capsys):
+    """What the user can put right is one clear line on stderr, without a traceback."""
+    extra = ["-o", str(tmp_path)] if arguments[0] == "demo" else []
+    assert cli.main([*arguments, *extra]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("warpslam: ") and message in err
+    assert "Traceback" not in err and len(err.strip().splitlines()) == 1
+
+
+def test_debug_shows_the_traceback():
+    """With --debug the exception comes through."""
+    from warpslam.errors import DatasetError
+
+    with pytest.raises(DatasetError):
+        cli.main(["eval", "/no/such/run", "--debug"])
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["fly"], ["run"], ["run", "x", "--frames", "5"], ["run", "x", "--frames", "a:b"], ["render", "x"]]
+)
+def test_wrong_arguments_exit_2(arguments, capsys):
+    """A command line that can't be parsed prints its usage."""
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(arguments)
+    assert exit_.value.code == 2
+    assert "usage:" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("0:200", slice(0, 200)), ("::2", slice(None, None, 2)), ("5:", slice(5, None)), (":-1:3", slice(None, -1, 3))],
+)
+def test_frames_are_a_python_slice(text, expected):
+    """A:B:STEP with any part left out."""
+    assert cli.parse_frames(text) == expected
+
+
+def test_eval_prints_figures(faked, tmp_path, capsys):
+    """RMSE aligned and unaligned in cm, RPE, and how many frames were compared; --json gives the same as JSON."""
+    import json
+
+    run = str(tmp_path / "run")
+    cli.main(["run", "seq", "-o", run])
+    capsys.readouterr()
+    assert cli.main(["eval", run]) == 0
+    out = capsys.readouterr().out
+    rmse = 100 * read_json(tmp_path / "run" / "metrics.json")["ate_m"]["unaligned"]["rmse"]
+    assert f"ATE unaligned    RMSE {rmse:.3f} cm" in out and "7 of 7 compared" in out
+    assert cli.main(["eval", run, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ate_m"]["unaligned"]["rmse"] == pytest.approx(rmse / 100, abs=5e-9)
+
+
+def test_eval_compares_the_mesh(faked, tmp_path, capsys):
+    """With a true surface on the command line the reconstruction figures are printed."""
+    cli.main(["run", "seq", "-o", str(tmp_path / "run"), "--frames", "0:3"])
+    wall().export(tmp_path / "wall.ply")
+    assert cli.main(["eval", str(tmp_path / "run"), "--truth-mesh", str(tmp_path / "wall.ply")]) == 0
+    assert "100.0 % within 5 cm" in capsys.readouterr().out
+
+
+def test_render_and_mesh_of_a_run(faked, tmp_path, capsys):
+    """Both write where they are told to and say so."""
+    run = str(tmp_path / "run")
+    cli.main(["run", "seq", "-o", run])
+    assert cli.main(["render", run, "--frame", "2", "-o", str(tmp_path / "two.png")]) == 0
+    assert cli.main(["mesh", run, "--voxel", "0.05", "-o", str(tmp_path / "m.ply")]) == 0
+    assert (tmp_path / "two.png").stat().st_size > 1000
+    assert f"{tmp_path / 'm.ply'}: 4 vertices, 2 faces" in capsys.readouterr().out
+
+
+def test_demo_runs_on_its_own_sequence(faked, tmp_path, monkeypatch, capsys):
+    """The demo needs no data, prints ATE and surface accuracy, and its settings can be overridden."""
+
+    class Demo(FakeSequence):
+        name, mesh = "demo", wall()
+
+    monkeypatch.setattr(demo, "demo_sequence", lambda: Demo(4))
+    assert cli.main(["demo", "--set", "mapping.window=4", "-o", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "ATE RMSE" in out and "surface     accuracy" in out
+    assert faked.configs[-1].mapping.window == 4
+    assert read_json(tmp_path / "input.json")["path"] is None
+
+
+def test_demo_sequence_is_small_and_exact():
+    """The embedded sequence has depth, truth and a surface that agree: depth points lie on the mesh."""
+    sequence = demo.demo_sequence()
+    frame = sequence[demo.FRAME_COUNT // 2]
+    assert len(sequence) == demo.FRAME_COUNT and frame.depth.shape == (demo.INTRINSICS.height, demo.INTRINSICS.width)
+    v, u = np.nonzero(frame.depth)
+    keep = slice(None, None, max(1, len(u) // 20))
+    z, k = frame.depth[v, u][keep].astype(float), sequence.intrinsics
+    points = np.stack([(u[keep] - k.cx) / k.fx * z, (v[keep] - k.cy) / k.fy * z, z, np.ones_like(z)])
+    world = (frame.T_world_camera @ points)[:3].T
+    from trimesh.proximity import closest_point_naive
+
+    assert closest_point_naive(sequence.mesh, world)[1].max() < 0.01
+
+
+def test_info_names_versions_devices_and_decoders(capsys, tmp_path):
+    """One screen that a bug report needs, with the decoder file that is asked about."""
+    from warpslam.decoders import random_decoders
+
+    random_decoders().save(tmp_path / "d.pth")
+    assert cli.main(["info", "--decoders", str(tmp_path / "d.pth")]) == 0
+    out = capsys.readouterr().out
+    for word in ("warpslam", "warp-lang", "torch", "cpu", "d.pth", "'coarse': 32", "replica", "tum_rgbd"):
+        assert word in out, word
+
+
+def test_version(capsys):
+    """The version is that of the package."""
+    import warpslam
+
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["--version"])
+    assert exit_.value.code == 0
+    assert capsys.readouterr().out.strip() == f"warpslam {warpslam.__version__}"
+
+
+def test_progress_bar_on_a_terminal(monkeypatch, faked, tmp_path):
+    """On a terminal the rich bar is fed with the same figures and ends at the total."""
+    import io
+
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stdout", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "160")
+    assert cli.main(["run", "seq", "--frames", "0:6", "-o", str(tmp_path)]) == 0
+    text = terminal.getvalue()
+    assert "fake sequence" in text and "6/6" in text and "ATE 0." in text and "fps" in text

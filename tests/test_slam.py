@@ -1,0 +1,236 @@
+"""The whole engine on a few small frames of a synthetic room."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from warpslam.camera import Intrinsics
+from warpslam.config import Config
+from warpslam.decoders import load_decoders
+from warpslam.errors import CheckpointError, InputError
+from warpslam.slam import Slam
+from warpslam.synthetic import SyntheticSequence
+
+CAMERA = Intrinsics(60.0, 60.0, 39.5, 29.5, 80, 60)
+DECODERS = load_decoders()
+DEVICES = ["cpu", *(str(d) for d in wp.get_cuda_devices())]
+SMALL = [
+    "tracking.pixels=64",
+    "tracking.iterations=3",
+    "tracking.ignore_edge_u=4",
+    "tracking.ignore_edge_v=4",
+    "tracking.lost_depth_error=10",
+    "tracking.lost_inliers=0",
+    "mapping.pixels=100",
+    "mapping.every=2",
+    "mapping.first_iterations=20",
+    "mapping.iterations=10",
+    "mapping.coarse_iterations=2",
+    "mapping.refinement_rounds=1",
+    "keyframes.every=2",
+]
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """Eight frames of a furnished room."""
+    sequence = SyntheticSequence(1, 8, intrinsics=CAMERA)
+    return [sequence[n] for n in range(8)]
+
+
+def new_slam(*overrides: str, device: str = "cpu", seed: int = 0) -> Slam:
+    return Slam(CAMERA, Config.from_preset("default", [*SMALL, *overrides]), device, seed, decoders=DECODERS)
+
+
+def run(frames, *overrides: str, device: str = "cpu", seed: int = 0) -> Slam:
+    slam = new_slam(*overrides, device=device, seed=seed)
+    for frame in frames:
+        slam.step(frame.rgb, frame.depth, frame.timestamp, frame.T_world_camera)
+    return slam
+
+
+def test_two_runs_are_bit_identical(frames):
+    """Same input and seed: the same poses and features to the last bit; another seed: others."""
+    a, b, c = run(frames[:4]), run(frames[:4]), run(frames[:4], seed=1)
+    a.finish(), b.finish()
+    np.testing.assert_array_equal(a.trajectory.poses, b.trajectory.poses)
+    for level in a.scene.grids:
+        np.testing.assert_array_equal(a.scene.grids[level].features.numpy(), b.scene.grids[level].features.numpy())
+    assert not np.array_equal(a.trajectory.poses[1:4], c.trajectory.poses[1:4])
+
+
+@pytest.mark.parametrize("optimizer", ["adam", "gauss_newton"])
+@pytest.mark.parametrize("device", DEVICES)
+def test_tracking_recovers_a_small_motion(frames, device, optimizer):
+    """Against a map made at the true pose, a start 2 cm and 1 degree off ends at less than half of that."""
+    settings = ["mapping.first_iterations=120", "mapping.pixels=400", "mapping.coarse=false", "tracking.pixels=300"]
+    steps = (
+        ["tracking.iterations=30", "tracking.learning_rate=3e-3"] if optimizer == "adam" else ["tracking.iterations=8"]
+    )
+    slam = run(frames[:1], *settings, *steps, f"tracking.optimizer={optimizer}", device=device)
+    truth = frames[0].T_world_camera
+    a = np.radians(1.0)
+    offset = np.eye(4)
+    offset[:3, :3] = [[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]]
+    offset[:3, 3] = [0.015, 0.01, -0.01]
+    result = slam._tracker.track(slam.scene.arrays(), slam._images, 1, truth @ offset)
+    error = np.linalg.inv(truth) @ result.T_world_camera
+    assert np.linalg.norm(error[:3, 3]) < 0.01
+    assert np.degrees(np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1))) < 0.5
+    assert result.inliers > 0.6
+
+
+def test_mapping_lowers_the_depth_error(frames):
+    """After the first frame the map renders its depth; a map that was not optimised does not."""
+    errors = []
+    for iterations in (1, 100):
+        slam = run(frames[:1], f"mapping.first_iterations={iterations}", "mapping.pixels=400", "mapping.coarse=false")
+        rendered = slam.render(frames[0].T_world_camera, depth=frames[0].depth, stride=4)
+        valid = frames[0].depth[::4, ::4] > 0
+        errors.append(np.abs(rendered.depth - frames[0].depth[::4, ::4])[valid].mean())
+    assert errors[1] < 0.15 < errors[0]
+
+
+def test_bundle_adjustment_writes_poses_back(frames):
+    """With enough keyframes, keyframe poses change and the trajectory holds the refined ones; the oldest stays."""
+    slam = run(frames, "mapping.bundle_adjustment_keyframes=2", "mapping.bundle_adjustment_rate=1e-3")
+    first, second = slam.keyframes[:2]
+    trajectory = slam.trajectory.poses
+    np.testing.assert_allclose(trajectory[first.index], frames[0].T_world_camera, atol=1e-6)
+    off = run(frames, "mapping.bundle_adjustment=false")
+    assert not np.allclose(second.pose, off.keyframes[1].pose)
+    for keyframe in slam.keyframes:
+        np.testing.assert_array_equal(slam._vectors[keyframe.index], keyframe.pose)
+
+
+def test_keyframes_by_interval_and_by_information_gain(frames):
+    """Every second frame; or when too little of the view is explained, which an impossible threshold makes every
+    frame.
+    """
+    assert [k.index for k in run(frames[:5]).keyframes] == [0, 2, 4]
+    gain = ["keyframes.policy=information_gain"]
+    assert [k.index for k in run(frames[:3], *gain, "keyframes.known_error=1e-9").keyframes] == [0, 1, 2]
+    assert [k.index for k in run(frames[:3], *gain, "keyframes.known_error=1e9").keyframes] == [0]
+
+
+def test_given_poses_are_taken(frames):
+    """With use_given_poses the trajectory is the truth, and a frame without a pose is refused."""
+    slam = run(frames[:3], "tracking.use_given_poses=true", "mapping.bundle_adjustment=false")
+    np.testing.assert_allclose(slam.trajectory.poses, [f.T_world_camera for f in frames[:3]], atol=1e-6)
+    with pytest.raises(InputError, match="frame 3"):
+        slam.step(frames[3].rgb, frames[3].depth)
+
+
+def test_only_vertices_in_the_frustum_change(frames):
+    """A mapping call leaves every vertex behind the camera as it was, to the bit."""
+    slam = run(frames[:1], "mapping.coarse=false")
+    grid = slam.scene.grids["middle"]
+    before = grid.features.numpy().copy()
+    slam._mapper.map_frame(slam._images, 1, slam._vectors[0], slam.keyframes)
+    index = np.stack(np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij"), -1).reshape(-1, 3)
+    camera = (grid.spacing * (grid.first + index) - frames[0].T_world_camera[:3, 3]) @ frames[0].T_world_camera[:3, :3]
+    behind = (camera[:, 2] < 0) & (np.linalg.norm(camera, axis=1) > 0.5)
+    changed = (grid.features.numpy() != before).any(axis=1)
+    assert changed.any() and behind.any()
+    assert not changed[behind].any()
+
+
+def test_frame_without_depth_is_skipped_and_the_run_goes_on(frames):
+    """Status SKIPPED with a reason; the map is untouched; the next frame is tracked."""
+    slam = run(frames[:2])
+    features = slam.scene.grids["middle"].features.numpy().copy()
+    result = slam.step(frames[2].rgb, np.zeros_like(frames[2].depth))
+    assert result.status == "SKIPPED" and "depth" in result.message
+    np.testing.assert_array_equal(slam.scene.grids["middle"].features.numpy(), features)
+    assert slam.step(frames[3].rgb, frames[3].depth).status == "OK"
+    assert slam.trajectory.status == ["OK", "OK", "SKIPPED", "OK"]
+
+
+def test_lost_frame_freezes_the_map(frames):
+    """Depth that disagrees with the map gives LOST, says why, and changes no feature."""
+    slam = run(frames[:1], "tracking.lost_depth_error=0.15", "mapping.every=1", "mapping.first_iterations=150")
+    features = slam.scene.grids["middle"].features.numpy().copy()
+    noise = np.random.default_rng(0).uniform(0.3, 5.0, frames[1].depth.shape).astype(np.float32)
+    result = slam.step(frames[1].rgb, noise)
+    assert result.status == "LOST" and result.message
+    np.testing.assert_array_equal(slam.scene.grids["middle"].features.numpy(), features)
+
+
+def test_bad_depth_values_never_enter_the_map(frames):
+    """NaN, infinity and negative depth count as missing: all features stay finite."""
+    depth = frames[0].depth.copy()
+    depth[::7], depth[1::7], depth[2::7] = np.nan, np.inf, -1.0
+    slam = new_slam()
+    slam.step(frames[0].rgb, depth, T_world_camera=frames[0].T_world_camera)
+    for grid in slam.scene.grids.values():
+        assert np.isfinite(grid.features.numpy()).all()
+
+
+def test_arrays_of_any_kind_give_the_same_result(frames):
+    """NumPy, torch and Warp arrays; uint8 or float colour; float or uint16 depth."""
+    frame = frames[0]
+    units = np.rint(frame.depth * 5000).astype(np.uint16)
+    metres = units / np.float32(5000)
+    floats = (frame.rgb / 255.0).astype(np.float32)
+    inputs = [
+        (frame.rgb, metres, None),
+        (floats, metres, None),
+        (torch.tensor(frame.rgb), torch.tensor(metres), None),
+        (wp.array(frame.rgb, dtype=wp.uint8), wp.array(metres, dtype=float), None),
+        (frame.rgb, units, 5000.0),
+    ]
+    images = [new_slam()._read_images(*arguments) for arguments in inputs]
+    for rgb, depth in images:
+        np.testing.assert_array_equal(rgb, images[0][0])
+        np.testing.assert_array_equal(depth, images[0][1])
+
+
+def test_misuse_is_refused(frames):
+    """Wrong shapes and types, integer depth without a scale, a pose that is none."""
+    slam, frame = new_slam(), frames[0]
+    for rgb, depth, match in [
+        (frame.rgb[:10], frame.depth, "rgb has shape"),
+        (frame.rgb, frame.depth[:10], "depth has shape"),
+        (frame.rgb.astype(np.int32), frame.depth, "rgb has dtype"),
+        (frame.rgb, (frame.depth * 1000).astype(np.uint16), "depth_scale"),
+        (frame.rgb.tolist(), frame.depth, "list"),
+    ]:
+        with pytest.raises(InputError, match=match):
+            slam.step(rgb, depth)
+    with pytest.raises(InputError, match="rotation"):
+        slam.step(frame.rgb, frame.depth, T_world_camera=np.zeros((4, 4)))
+    with pytest.raises(InputError, match="empty"):
+        slam.render(np.eye(4))
+    with pytest.raises(InputError, match="ignore_edge"):
+        Slam(dataclasses.replace(CAMERA, width=8), Config())
+
+
+def test_saved_state_goes_on_exactly(frames, tmp_path):
+    """A run that is saved, loaded and continued equals one that was never interrupted."""
+    whole = run(frames[:6])
+    half = run(frames[:3])
+    half.save(tmp_path / "map.npz")
+    loaded = Slam.load(tmp_path / "map.npz", "cpu")
+    for frame in frames[3:6]:
+        loaded.step(frame.rgb, frame.depth, frame.timestamp)
+    np.testing.assert_array_equal(loaded.trajectory.poses, whole.trajectory.poses)
+    assert loaded.trajectory.status == whole.trajectory.status
+    for level, grid in whole.scene.grids.items():
+        np.testing.assert_array_equal(loaded.scene.grids[level].features.numpy(), grid.features.numpy())
+
+
+def test_unusable_map_file(frames, tmp_path):
+    """Missing, truncated, or foreign: CheckpointError with the path."""
+    with pytest.raises(CheckpointError, match="nothing.npz"):
+        Slam.load(tmp_path / "nothing.npz")
+    path = tmp_path / "map.npz"
+    run(frames[:1]).save(path)
+    path.write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(CheckpointError, match="map.npz"):
+        Slam.load(path)
+    np.savez(path, something=np.zeros(3))
+    with pytest.raises(CheckpointError, match="map.npz"):
+        Slam.load(path)
