@@ -26,6 +26,8 @@ import torch  # noqa: E402
 from pretraining import evaluation  # noqa: E402
 from pretraining.room_samples import HELD_OUT_SEED, SampleSizes, load_room, prepare_rooms  # noqa: E402
 from pretraining.training import Trainer, TrainingConfig  # noqa: E402
+from rich.console import Console  # noqa: E402
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn  # noqa: E402
 
 from warpslam.decoders import load_decoders, random_decoders  # noqa: E402
 from warpslam.errors import WarpSlamError  # noqa: E402
@@ -62,7 +64,14 @@ def train(options: argparse.Namespace) -> int:
         trainer.weights().save(out / "decoders.pth")
         _plot(trainer.progress.history, out / "losses.png")
 
-    trainer.run(options.minutes, save, report, max_steps=options.max_steps)
+    with Progress(TextColumn("training"), BarColumn(), TimeRemainingColumn(), console=Console(stderr=True)) as bar:
+        task = bar.add_task("training", total=60 * options.minutes, completed=trainer.progress.elapsed)
+
+        def follow(message: str) -> None:
+            report(message)
+            bar.update(task, completed=trainer.progress.elapsed)
+
+        trainer.run(options.minutes, save, follow, max_steps=options.max_steps)
     done = trainer.progress
     report(f"done: {done.encoder_steps} encoder steps, {done.episodes} episodes, {done.mapping_steps} mapping steps")
     return 0
@@ -77,9 +86,14 @@ def evaluate(options: argparse.Namespace) -> int:
         candidates[name] = load_decoders(path)
     rooms = _rooms(options, range(HELD_OUT_SEED, HELD_OUT_SEED + options.rooms), report)
     budgets = tuple(options.budgets)
-    result = evaluation.compare(
-        candidates, rooms, budgets, rays=options.rays, factor=options.factor, device=options.device
-    )
+    settings = {"rays": options.rays, "factor": options.factor, "scale": options.scale, "device": options.device}
+    result = evaluation.compare(candidates, rooms, budgets, **settings)
+    if options.free_start:
+        others = _rooms(options, range(HELD_OUT_SEED + 100, HELD_OUT_SEED + 102), report)
+        for name, weights in list(candidates.items()):
+            start = evaluation.free_space_feature(weights, others)
+            named = {f"{name}, free-space start": weights}
+            result |= evaluation.compare(named, rooms, budgets, start=start, **settings)
     (out / "evaluation.json").write_text(json.dumps(result, indent=1))
     (out / "evaluation.md").write_text(evaluation.table(result) + "\n")
     report(evaluation.table(result))
@@ -178,6 +192,10 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--rooms", type=int, default=4, help="held-out rooms")
     command.add_argument("--rays", type=int, default=200, help="rays of an iteration")
     command.add_argument("--factor", type=float, default=1.0, help="on learning rates; 5 as on a first frame")
+    command.add_argument("--scale", type=float, default=1.0, help="on vertex spacings; 0.5 as for TUM RGB-D")
+    command.add_argument(
+        "--free-start", action="store_true", help="also start middle features at the mean one of free space"
+    )
     command.add_argument("--budgets", type=int, nargs="+", default=[10, 30, 60, 120], help="mapping iterations")
     command.add_argument("--seed", type=int, default=0, help="seed of the random decoders")
     command.set_defaults(run=evaluate)

@@ -21,12 +21,15 @@ def fit_room(
     *,
     rays: int = 200,
     factor: float = 1.0,
+    scale: float = 1.0,
+    start: torch.Tensor | None = None,
     device: str = "cpu",
 ) -> dict[str, float]:
     """Map one room from scratch, three views, and measure on rays and points that were not trained on.
 
     The colour decoder is trained along in the colour stage, as in a run; the others are frozen. `factor` multiplies all
-    learning rates (5 on the first frame of a run).
+    learning rates (5 on the first frame of a run), `scale` all vertex spacings; `start` (32,) is added to the initial
+    middle features.
 
     Returns:
         depth_l1_cm: Mean error of the rendered distance [cm].
@@ -35,14 +38,46 @@ def fit_room(
         color_l1: Mean absolute error of a rendered colour channel, in [0, 1] units.
         residual_rms: Root mean square of the fine decoder's logit where its feature is zero, middle feature as fitted.
     """
+    fit = _fit(weights, room, iterations, seed, rays, factor, scale, start, device)
+    with torch.no_grad():
+        return _measure(*fit, room)
+
+
+def free_space_feature(weights: Decoders, rooms: list[dict[str, np.ndarray]], iterations: int = 60) -> torch.Tensor:
+    """Mean middle feature (32,) of vertices that only samples in front of a surface (by more than 0.3 m) touch."""
+    found = []
+    for i, room in enumerate(rooms):
+        _, pool, features, _ = _fit(weights, room, iterations, i, 200, 1.0, 1.0, None, "cpu")
+        rows, weight = pool.stencils["middle"]
+        solid = ((pool.z > pool.distance[:, None] - 0.3)[..., None] & (weight > 0)).expand_as(rows)
+        free = torch.ones(len(features["middle"]), dtype=torch.bool)
+        free[rows[solid]] = False
+        found.append(features["middle"].detach()[free])
+    return torch.cat(found).mean(dim=0)
+
+
+def _fit(
+    weights: Decoders,
+    room: dict[str, np.ndarray],
+    iterations: int,
+    seed: int,
+    rays: int,
+    factor: float,
+    scale: float,
+    start: torch.Tensor | None,
+    device: str,
+) -> tuple[DecoderSet, RayPool, dict[str, torch.Tensor], torch.Tensor]:
+    """Decoders, rays, fitted features, and the indices of rays kept for the test."""
     rng = np.random.default_rng([seed, 5])
     generator = torch.Generator().manual_seed(seed)
     decoders = DecoderSet(weights).to(device)
     for parameter in decoders.parameters():
         parameter.requires_grad_(False)
     color_parameters = list(decoders.color.parameters())
-    pool = RayPool(room, rng.choice(len(room["origins"]), CAMERA_COUNT, replace=False), rng, device)
+    pool = RayPool(room, rng.choice(len(room["origins"]), CAMERA_COUNT, replace=False), rng, device, scale=scale)
     features = pool.initial_features(generator)
+    if start is not None:
+        features["middle"].data += start
     optimizer = FeatureOptimizer(features, factor)
     color_adam = torch.optim.Adam(color_parameters, lr=0.005 * factor)
     order = torch.randperm(len(pool), generator=generator).to(device)
@@ -57,11 +92,10 @@ def fit_room(
         if stage == "color":
             color_adam.step()
             color_adam.zero_grad(set_to_none=True)
-    with torch.no_grad():
-        return _measure(decoders, pool, features, test, room, rng)
+    return decoders, pool, features, test
 
 
-def _measure(decoders: DecoderSet, pool: RayPool, features: dict, test: torch.Tensor, room: dict, rng) -> dict:
+def _measure(decoders: DecoderSet, pool: RayPool, features: dict, test: torch.Tensor, room: dict) -> dict:
     batch = pool.batch(test)
     distance, color = render(decoders, "color", batch, features)
     # Points behind and in front of the surfaces the test rays hit; labels come from the room, not from the ray.
@@ -100,6 +134,8 @@ def compare(
     *,
     rays: int = 200,
     factor: float = 1.0,
+    scale: float = 1.0,
+    start: torch.Tensor | None = None,
     device: str = "cpu",
 ) -> dict[str, dict[str, dict[str, float]]]:
     """Mean over rooms of `fit_room`, by candidate and iteration budget; every candidate sees the same rays."""
@@ -108,7 +144,7 @@ def compare(
         result[name] = {}
         for budget in budgets:
             fits = [
-                fit_room(weights, room, budget, i, rays=rays, factor=factor, device=device)
+                fit_room(weights, room, budget, i, rays=rays, factor=factor, scale=scale, start=start, device=device)
                 for i, room in enumerate(rooms)
             ]
             result[name][str(budget)] = {key: float(np.mean([fit[key] for fit in fits])) for key in fits[0]}

@@ -17,11 +17,12 @@ from warpslam.decoders import FEATURE_SIZE
 
 STAGES = ("middle", "fine", "color")
 LEARNING_RATES = {
+    "coarse": {"coarse": 0.001},
     "middle": {"middle": 0.1},
     "fine": {"middle": 0.005, "fine": 0.005},
     "color": {"middle": 0.005, "fine": 0.005, "color": 0.005},
 }
-INITIAL_SPREAD = {"middle": 0.01, "fine": 0.0001, "color": 0.01}
+INITIAL_SPREAD = {"coarse": 0.01, "middle": 0.01, "fine": 0.0001, "color": 0.01}
 COLOR_WEIGHT = 0.2
 STRATIFIED_COUNT, SURFACE_COUNT = 32, 16
 
@@ -65,8 +66,21 @@ class Batch:
 class RayPool:
     """Rays of a few cameras of one placed room, sampled as the mapper samples them, on a table of touched vertices."""
 
-    def __init__(self, room: dict[str, np.ndarray], cameras: np.ndarray, rng: np.random.Generator, device: str) -> None:
-        """Place the room at random and take all rays of the cameras (indices)."""
+    def __init__(
+        self,
+        room: dict[str, np.ndarray],
+        cameras: np.ndarray,
+        rng: np.random.Generator,
+        device: str,
+        *,
+        scale: float = 1.0,
+        coarse: bool = False,
+    ) -> None:
+        """Place the room at random and take all rays of the cameras (indices).
+
+        `scale` multiplies the vertex spacings; with `coarse`, the coarse level and its samples are made instead of the
+        others, which that level's stage does not need.
+        """
         rotation, shift = random_placement(rng)
         directions = room["directions"][cameras].reshape(-1, 3)
         origins = np.repeat(room["origins"][cameras], room["directions"].shape[1], axis=0)
@@ -77,12 +91,14 @@ class RayPool:
         self.directions = self._tensor(directions[seen] @ rotation.T)
         self.distance = self._tensor(distance[seen])
         self.color = self._tensor(room["ray_colors"][cameras].reshape(-1, 3)[seen])
-        self.z = sample_distances(self.distance)
+        noise = torch.Generator().manual_seed(int(rng.integers(2**31)))
+        self.z = sample_unguided(self.distance) if coarse else sample_distances(self.distance, noise)
         self.points = self.origins[:, None] + self.directions[:, None] * self.z[..., None]
         self.lattices, self.touched, self.stencils = {}, {}, {}
         flat = self.points.reshape(-1, 3)
-        for level in ("middle", "fine"):
-            lattice = Lattice.covering(flat.amin(0, keepdim=True), flat.amax(0, keepdim=True), SPACING[level])
+        for level in ("coarse",) if coarse else ("middle", "fine"):
+            spacing = SPACING[level] * scale
+            lattice = Lattice.covering(flat.amin(0, keepdim=True), flat.amax(0, keepdim=True), spacing)
             rows, weights = self._stencil(lattice, flat)
             self.lattices[level] = lattice
             self.touched[level], compact = torch.unique(rows, return_inverse=True)
@@ -112,13 +128,14 @@ class RayPool:
 
     def initial_features(self, generator: torch.Generator) -> dict[str, Tensor]:
         """Feature tables as a fresh map has them."""
-        count = {"middle": len(self.touched["middle"]), "fine": len(self.touched["fine"])}
-        count["color"] = count["fine"]
+        count = {level: len(rows) for level, rows in self.touched.items()}
+        if "fine" in count:
+            count["color"] = count["fine"]
         return {
-            level: (spread * torch.randn(count[level], FEATURE_SIZE, generator=generator))
+            level: (INITIAL_SPREAD[level] * torch.randn(rows, FEATURE_SIZE, generator=generator))
             .to(self.device)
             .requires_grad_()
-            for level, spread in INITIAL_SPREAD.items()
+            for level, rows in count.items()
         }
 
     def _tensor(self, array: np.ndarray) -> Tensor:
@@ -128,16 +145,28 @@ class RayPool:
         return lattice.stencil(points, torch.zeros(len(points), dtype=torch.long, device=points.device))
 
 
-def sample_distances(distance: Tensor) -> Tensor:
-    """Sorted sample distances (P, 48) [m]: 32 from 1 % of the ray's depth to 1.2 x the largest, 16 within 5 %."""
-    s = torch.linspace(0, 1, STRATIFIED_COUNT, device=distance.device)
-    stratified = 0.01 * distance[:, None] * (1 - s) + 1.2 * distance.max() * s
-    surface = distance[:, None] * torch.linspace(0.95, 1.05, SURFACE_COUNT, device=distance.device)
+def sample_distances(distance: Tensor, generator: torch.Generator) -> Tensor:
+    """Sorted sample distances (P, 48) [m], random in their strata: 32 up to 1.2 x the largest depth, 16 within 5 %."""
+    first = 0.01 * distance[:, None]
+    stratified = first + (1.2 * distance.max() - first) * _strata(len(distance), STRATIFIED_COUNT, generator).to(first)
+    surface = distance[:, None] * (0.95 + 0.1 * _strata(len(distance), SURFACE_COUNT, generator).to(first))
     return torch.cat([stratified, surface], dim=1).sort(dim=1).values
 
 
+def sample_unguided(distance: Tensor) -> Tensor:
+    """Sample distances (P, 32) [m] of the coarse stage, which are not told the depth."""
+    s = torch.linspace(0, 1, STRATIFIED_COUNT, device=distance.device)
+    return (0.01 + 1.3 * distance.max() * s).expand(len(distance), -1)
+
+
+def _strata(rays: int, count: int, generator: torch.Generator) -> Tensor:
+    return (torch.arange(count) + torch.rand(rays, count, generator=generator)) / count
+
+
 def query_occupancy(decoders: DecoderSet, stage: str, points: Tensor, features: dict, stencils: dict) -> Tensor:
-    """Occupancy logits (N,) at world points (N, 3): middle, plus the fine residual from the fine stage on (Eq. 3)."""
+    """Occupancy logits (N,) at world points (N, 3): coarse, or middle plus, from the fine stage on, fine (Eq. 1-3)."""
+    if stage == "coarse":
+        return decoders.coarse(points, interpolate(features["coarse"], stencils["coarse"]))
     middle = interpolate(features["middle"], stencils["middle"])
     logits = decoders.middle(points, middle)
     if stage == "middle":

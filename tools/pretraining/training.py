@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from pretraining.mapping import FeatureOptimizer, RayPool, mapping_loss, query_occupancy, random_placement
 from pretraining.networks import OCCUPANCY_GAIN, SPACING, DecoderSet, Lattice, PointEncoder, interpolate
-from warpslam.decoders import LEVELS, Decoders, load_decoders, random_decoders
+from warpslam.decoders import EMBEDDING_SCALE, LEVELS, Decoders, load_decoders, random_decoders
 from warpslam.errors import CheckpointError
 
 UNET_DEPTH = {"coarse": 1, "middle": 2, "fine": 1, "color": 1}
@@ -40,7 +40,8 @@ class TrainingConfig:
     """Settings that a resumed run must share."""
 
     seed: int = 0
-    encoder_share: float = 0.35  # of the training time, for phase 1
+    fourier_scale: float = 25.0  # standard deviation of the embedding's frequencies at the start [1/m]
+    encoder_share: float = 0.1  # of the training time, for phase 1
     crop_count: int = 3  # crops in a batch of phase 1
     crop_size: float = 2.56  # [m], a multiple of every fine and middle spacing
     cloud_size: int = 2500  # surface points that the encoder sees in a crop
@@ -49,13 +50,17 @@ class TrainingConfig:
     scene_count: int = 12  # rooms that are mapped in one episode of phase 2
     turn_count: int = 2  # of these, how many take a step at a time
     camera_count: int = 2  # views of each
-    ray_count: int = 200  # rays of a room in one step
+    coarse_share: float = 0.25  # of the rooms of an episode, for the coarse level alone
+    finer_share: float = 0.25  # of the other rooms, with half the vertex spacing
+    first_share: float = 0.2  # of the rooms, at the learning rates of a run's first frame
+    ray_count: int = 160  # rays of a room in one step
     longest_mapping: int = 60  # iterations of a room in an episode; the shortest has 10
     mapping_rate: float = 1e-3  # Adam learning rate of the decoders in phase 2, at its start
     mapping_rate_end: float = 3e-5  # and at its end (cosine)
     label_count: int = 1500  # labelled points of a room in one step
-    label_weight: float = 1.0  # of the cross entropy [nats] beside the depth error [m] in phase 2
-    residual_weight: float = 10.0  # of the squared fine logit where the fine feature is zero
+    label_weight: float = 0.3  # of the cross entropy [nats] beside the depth error [m] in phase 2
+    residual_weight: float = 50.0  # of the squared fine logit where the fine feature is zero
+    feature_scale: float = 1.0  # on FEATURE_SCALE
     feature_weight: float = 1e-3  # of the squared features of the encoder, before FEATURE_SCALE
 
 
@@ -85,9 +90,10 @@ class Trainer:
         self.config, self.rooms, self.device = config, rooms, device
         self.rng = np.random.default_rng(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.decoders = DecoderSet(start or random_decoders(config.seed)).to(device)
+        self.decoders = DecoderSet(start or _random_start(config)).to(device)
+        scale = {level: config.feature_scale * FEATURE_SCALE[level] for level in LEVELS}
         self.encoders = nn.ModuleDict(
-            {lv: PointEncoder(SPACING[lv], depth=UNET_DEPTH[lv], scale=FEATURE_SCALE[lv]) for lv in LEVELS}
+            {lv: PointEncoder(SPACING[lv], depth=UNET_DEPTH[lv], scale=scale[lv]) for lv in LEVELS}
         ).to(device)
         parameters = [*self.decoders.parameters(), *self.encoders.parameters()]
         self.encoder_adam = torch.optim.Adam(parameters, lr=config.encoder_rate)
@@ -145,7 +151,7 @@ class Trainer:
             features[level] = self.encoders[level](
                 batch[cloud], batch[cloud + "_normals"], batch[cloud + "_colors"], scene[cloud], lattices[level]
             )
-            sizes[level] = (features[level] / FEATURE_SCALE[level]).square().mean()
+            sizes[level] = (features[level] / self.encoders[level].scale).square().mean()
 
         def look_up(level: str, name: str) -> Tensor:
             return interpolate(features[level], lattices[level].stencil(batch[name], scene[name]))
@@ -191,6 +197,8 @@ class Trainer:
                 position = scene["done"] / scene["iterations"]
                 # Geometry has the larger share here than in the mapper: it is what tracking depends on.
                 stage = "middle" if position < 0.5 else "fine" if position < 0.8 else "color"
+                if scene["coarse"]:
+                    stage = "coarse"
                 scene["losses"][stage] = self._mapping_step(scene, stage)
                 scene["done"] += 1
             nn.utils.clip_grad_norm_(self.decoders.parameters(), 1.0)
@@ -269,7 +277,7 @@ class Trainer:
         logits = query_occupancy(self.decoders, stage, points, frozen, stencils)
         labels = _cross_entropy(logits, scene["occupied"][some])
         total = loss + self.config.label_weight * labels
-        if stage != "middle":
+        if stage in ("fine", "color"):
             middle = interpolate(frozen["middle"], stencils["middle"])
             total = total + self.config.residual_weight * self._silence(points, middle)
         (total / self.config.turn_count).backward()
@@ -281,7 +289,9 @@ class Trainer:
         while True:
             room = self.rooms[self.rng.integers(len(self.rooms))]
             cameras = self.rng.choice(len(room["origins"]), self.config.camera_count, replace=False)
-            pool = RayPool(room, cameras, self.rng, self.device)
+            coarse = self.rng.random() < self.config.coarse_share
+            scale = 0.5 if not coarse and self.rng.random() < self.config.finer_share else 1.0
+            pool = RayPool(room, cameras, self.rng, self.device, scale=scale, coarse=coarse)
             index = self.rng.integers(0, len(room["points"]), 30_000)
             rotation, shift = pool.rotation.astype(np.float32), pool.shift.astype(np.float32)
             points = torch.as_tensor(room["points"][index] @ rotation.T + shift, device=self.device)
@@ -289,10 +299,12 @@ class Trainer:
             if known.sum() >= 500:
                 break
         features = pool.initial_features(self.generator)
-        # The first frame of a run is mapped with five times the learning rates.
-        factor = 5.0 if self.rng.random() < 0.2 else 1.0
+        # The first frame of a run is mapped with five times the learning rates. The coarse level has small ones: at the
+        # plain rate an episode would leave its features where they are.
+        factor = 5.0 if coarse or self.rng.random() < self.config.first_share else 1.0
         return {
-            "iterations": int(self.rng.integers(10, self.config.longest_mapping + 1)),
+            "coarse": coarse,
+            "iterations": int(self.rng.integers(10, (2 if coarse else 1) * self.config.longest_mapping + 1)),
             "done": 0,
             "losses": {},
             "pool": pool,
@@ -345,6 +357,14 @@ class Trainer:
             "whole_box": np.stack([points.min(axis=0), points.max(axis=0)]),
         }
         return {name: torch.as_tensor(a.astype(np.float32), device=self.device) for name, a in arrays.items()}
+
+
+def _random_start(config: TrainingConfig) -> Decoders:
+    decoders = random_decoders(config.seed)
+    for weights in decoders:
+        if "embedder._B" in weights.tensors:
+            weights.tensors["embedder._B"] *= config.fourier_scale / EMBEDDING_SCALE
+    return decoders
 
 
 def _cross_entropy(logits: Tensor, labels: Tensor) -> Tensor:
