@@ -63,7 +63,7 @@ def compare_views(options: argparse.Namespace, decoders: dict[str, Decoders]) ->
     for budget in options.budgets:
         cells = []
         for weights in decoders.values():
-            slam = _map_frames(sequence, mapped, weights, [f"mapping.iterations={budget}", *options.set])
+            slam = _map_frames(sequence, mapped, weights, [*options.set, f"mapping.iterations={budget}"])
             rows = [_view_errors(slam, sequence, index) for index in held_back]
             cells.append(", ".join(f"{value:.2f}" for value in np.mean(rows, axis=0)))
         print(f"| {budget} | " + " | ".join(cells) + " |", flush=True)
@@ -82,7 +82,7 @@ def compare_first_frame(options: argparse.Namespace, decoders: dict[str, Decoder
         for name, weights in decoders.items():
             tried = []
             for budget in FIRST_BUDGETS:
-                overrides = [f"mapping.first_iterations={budget}", "mapping.coarse=false", *options.set]
+                overrides = [*options.set, f"mapping.first_iterations={budget}", "mapping.coarse=false"]
                 slam = _map_frames(sequence, range(1), weights, overrides, finish=False)
                 frame = sequence[0]
                 image = slam.render(frame.T_world_camera, depth=frame.depth, stride=4)
