@@ -40,7 +40,7 @@ def test_residual_tells_silent_decoders_from_random_ones(folder, capsys):
     """The package's fine decoder is silent without its feature, a random one is not."""
     assert compare_decoders.main(["residual", "ours", "random", "--sequence", str(folder), "--step", "4", *QUICK]) == 0
     ours, chance = (float(x) for x in re.findall(r"for ([\d.]+) %", capsys.readouterr().out))
-    assert ours > 90 > 50 > chance
+    assert ours > 80 > 50 > chance
 
 
 def test_observed_is_in_front_of_the_surface():

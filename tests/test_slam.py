@@ -66,7 +66,7 @@ def test_two_runs_are_bit_identical(frames):
 @pytest.mark.parametrize("device", DEVICES)
 def test_tracking_recovers_a_small_motion(frames, device, optimizer):
     """Against a map made at the true pose, a start 2 cm and 1 degree off ends at less than half of that."""
-    settings = ["mapping.first_iterations=120", "mapping.pixels=400", "mapping.coarse=false", "tracking.pixels=300"]
+    settings = ["mapping.first_iterations=200", "mapping.pixels=400", "mapping.coarse=false", "tracking.pixels=300"]
     steps = (
         ["tracking.iterations=30", "tracking.learning_rate=3e-3"] if optimizer == "adam" else ["tracking.iterations=8"]
     )

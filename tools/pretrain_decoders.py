@@ -136,17 +136,18 @@ def _plot(history: list[dict[str, float]], path: Path) -> None:
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(11, 4))
-    names = {1.0: ("coarse", "middle", "fine", "color"), 2.0: ("middle_depth", "fine_depth", "color_depth")}
+    levels = ("coarse", "middle", "fine", "color")
+    names = {1.0: levels, 2.0: tuple(f"{level}_depth" for level in levels)}
     titles = {1.0: "phase 1: cross entropy [nats], colour L1", 2.0: "phase 2: depth error at a stage's end [m]"}
     for axis, phase in zip(axes, names, strict=True):
-        rows = [row for row in history if row["phase"] == phase]
         for name in names[phase]:
-            if rows and name in rows[0]:
+            rows = [row for row in history if row["phase"] == phase and name in row]
+            if rows:
                 window = max(1, len(rows) // 40)
                 values = np.convolve([row[name] for row in rows], np.full(window, 1 / window), "valid")
                 axis.plot([row["elapsed"] / 60 for row in rows][window - 1 :], values, label=name)
         axis.set(title=titles[phase], xlabel="minutes", yscale="log")
-        if rows:
+        if axis.lines:
             axis.legend()
     figure.tight_layout()
     figure.savefig(path, dpi=90)

@@ -92,7 +92,8 @@ class RayPool:
         self.distance = self._tensor(distance[seen])
         self.color = self._tensor(room["ray_colors"][cameras].reshape(-1, 3)[seen])
         noise = torch.Generator().manual_seed(int(rng.integers(2**31)))
-        self.z = sample_unguided(self.distance) if coarse else sample_distances(self.distance, noise)
+        reach = rng.uniform(1.05, 2.0)
+        self.z = sample_unguided(self.distance, reach) if coarse else sample_distances(self.distance, noise)
         self.points = self.origins[:, None] + self.directions[:, None] * self.z[..., None]
         self.lattices, self.touched, self.stencils = {}, {}, {}
         flat = self.points.reshape(-1, 3)
@@ -153,10 +154,10 @@ def sample_distances(distance: Tensor, generator: torch.Generator) -> Tensor:
     return torch.cat([stratified, surface], dim=1).sort(dim=1).values
 
 
-def sample_unguided(distance: Tensor) -> Tensor:
-    """Sample distances (P, 32) [m] of the coarse stage, which are not told the depth."""
+def sample_unguided(distance: Tensor, reach: float) -> Tensor:
+    """Sample distances (P, 32) [m] of the coarse stage, which are not told the depth, up to `reach` x the largest."""
     s = torch.linspace(0, 1, STRATIFIED_COUNT, device=distance.device)
-    return (0.01 + 1.3 * distance.max() * s).expand(len(distance), -1)
+    return (0.01 + reach * distance.max() * s).expand(len(distance), -1)
 
 
 def _strata(rays: int, count: int, generator: torch.Generator) -> Tensor:

@@ -50,7 +50,7 @@ class TrainingConfig:
     scene_count: int = 12  # rooms that are mapped in one episode of phase 2
     turn_count: int = 2  # of these, how many take a step at a time
     camera_count: int = 2  # views of each
-    coarse_share: float = 0.25  # of the rooms of an episode, for the coarse level alone
+    coarse_share: float = 0.0  # of the rooms of an episode, for the coarse level alone: forecasts get worse by it
     finer_share: float = 0.25  # of the other rooms, with half the vertex spacing
     first_share: float = 0.2  # of the rooms, at the learning rates of a run's first frame
     ray_count: int = 160  # rays of a room in one step
@@ -59,6 +59,7 @@ class TrainingConfig:
     mapping_rate_end: float = 3e-5  # and at its end (cosine)
     label_count: int = 1500  # labelled points of a room in one step
     label_weight: float = 0.3  # of the cross entropy [nats] beside the depth error [m] in phase 2
+    coarse_label_weight: float = 2.0  # the same for the coarse level, whose labels reach beyond what is seen
     residual_weight: float = 50.0  # of the squared fine logit where the fine feature is zero
     feature_scale: float = 1.0  # on FEATURE_SCALE
     feature_weight: float = 1e-3  # of the squared features of the encoder, before FEATURE_SCALE
@@ -276,7 +277,8 @@ class Trainer:
         points = scene["points"][some]
         logits = query_occupancy(self.decoders, stage, points, frozen, stencils)
         labels = _cross_entropy(logits, scene["occupied"][some])
-        total = loss + self.config.label_weight * labels
+        weight = self.config.coarse_label_weight if stage == "coarse" else self.config.label_weight
+        total = loss + weight * labels
         if stage in ("fine", "color"):
             middle = interpolate(frozen["middle"], stencils["middle"])
             total = total + self.config.residual_weight * self._silence(points, middle)
@@ -300,11 +302,11 @@ class Trainer:
                 break
         features = pool.initial_features(self.generator)
         # The first frame of a run is mapped with five times the learning rates. The coarse level has small ones: at the
-        # plain rate an episode would leave its features where they are.
+        # plain rate an episode would leave its features where they are. Its iterations are cheap, and a run has many.
         factor = 5.0 if coarse or self.rng.random() < self.config.first_share else 1.0
         return {
             "coarse": coarse,
-            "iterations": int(self.rng.integers(10, (2 if coarse else 1) * self.config.longest_mapping + 1)),
+            "iterations": int(self.rng.integers(10, (10 if coarse else 1) * self.config.longest_mapping + 1)),
             "done": 0,
             "losses": {},
             "pool": pool,
