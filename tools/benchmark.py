@@ -101,7 +101,7 @@ def alternate(pairs: dict[str, tuple[Callable, Callable]], repeats: int) -> dict
     """Median seconds of both functions of each pair, run in turns."""
     result = {}
     for name, (ours, theirs) in pairs.items():
-        ours()
+        ours(), theirs()
         times: list[list[float]] = [[], []]
         for _ in range(repeats):
             for column, function in zip(times, (ours, theirs), strict=True):
