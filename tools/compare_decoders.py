@@ -24,6 +24,7 @@ import numpy as np
 import torch
 import trimesh
 import warp as wp
+from evaluate_views import view_errors
 from pretraining.networks import LevelDecoder
 from pretraining.room_samples import HELD_OUT_SEED
 from scipy.ndimage import distance_transform_edt
@@ -33,6 +34,7 @@ from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.decoders import Decoders, load_decoders, random_decoders
 from warpslam.errors import WarpSlamError
+from warpslam.evaluation import visible_points
 from warpslam.sequences import RgbdSequence, open_sequence
 from warpslam.slam import Slam
 from warpslam.synthetic import MeshRenderer, SyntheticSequence, look_at
@@ -40,6 +42,7 @@ from warpslam.synthetic import MeshRenderer, SyntheticSequence, look_at
 CAMERA = Intrinsics(fx=250.0, fy=250.0, cx=159.5, cy=119.5, width=320, height=240)
 FORECAST_OFFSET = 0.2  # added to the coarse logit where it forecasts (released code)
 SEEN, SHELL = 0.05, 1.0  # [m] tolerance of "seen", depth of the shell beyond it
+STRIDE = 4  # every fourth pixel of a view is rendered
 FIRST_BUDGETS = (15, 25, 40, 60, 90, 130, 200, 300, 450, 700, 1000, 1500, 2250)
 
 
@@ -84,9 +87,8 @@ def compare_first_frame(options: argparse.Namespace, decoders: dict[str, Decoder
             for budget in FIRST_BUDGETS:
                 overrides = [*options.set, f"mapping.first_iterations={budget}", "mapping.coarse=false"]
                 slam = _map_frames(sequence, range(1), weights, overrides, finish=False)
-                frame = sequence[0]
-                image = slam.render(frame.T_world_camera, depth=frame.depth, stride=4)
-                tried.append((budget, *_errors(image, frame, 4)))
+                depth, _, quality = view_errors(slam, sequence[0], STRIDE, guided=True)
+                tried.append((budget, depth, quality))
                 if tried[-1][1] < 3.0 and tried[-1][2] > 22.0:
                     break
             budget, depth, psnr = tried[-1] if tried[-1][1] < 3.0 else min(tried, key=lambda row: row[1])
@@ -156,21 +158,11 @@ def _map_frames(
     return slam
 
 
-def _errors(image, frame, stride: int) -> tuple[float, float]:
-    """Depth L1 [cm] and PSNR [dB] of a rendering of every `stride`-th pixel."""
-    depth, rgb = frame.depth[::stride, ::stride], frame.rgb[::stride, ::stride] / 255.0
-    valid = depth > 0
-    psnr = -10 * float(np.log10(np.mean((image.rgb - rgb) ** 2)))
-    return 100 * float(np.abs(image.depth - depth)[valid].mean()), psnr
-
-
-def _view_errors(slam: Slam, sequence: RgbdSequence, index: int, stride: int = 4) -> list[float]:
+def _view_errors(slam: Slam, sequence: RgbdSequence, index: int) -> list[float]:
+    """Depth L1 [cm]: mean with guided samples, mean and median by the map alone."""
     frame = sequence[index]
-    depth = frame.depth[::stride, ::stride]
-    guided = slam.render(frame.T_world_camera, depth=frame.depth, stride=stride)
-    alone = slam.render(frame.T_world_camera, stride=stride)
-    error = 100 * np.abs(alone.depth - depth)[depth > 0]
-    return [_errors(guided, frame, stride)[0], float(error.mean()), float(np.median(error))]
+    alone = view_errors(slam, frame, STRIDE, guided=False)
+    return [view_errors(slam, frame, STRIDE, guided=True)[0], *alone[:2]]
 
 
 def _iou(found: np.ndarray, truth: np.ndarray) -> float:
@@ -182,17 +174,9 @@ def _observed(sequence: SyntheticSequence, frames: range) -> tuple[np.ndarray, n
     low, high = sequence.room.bounds
     axes = [np.arange(a + 0.05, b, 0.1) for a, b in zip(low, high, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    camera, seen = sequence.intrinsics, np.zeros(len(points), bool)
-    for frame in (sequence[index] for index in frames):
-        T = np.linalg.inv(frame.T_world_camera)
-        x, y, z = (points @ T[:3, :3].T + T[:3, 3]).T
-        front = z > 0.05
-        safe = np.where(front, z, 1.0)
-        u = np.rint(camera.fx * x / safe + camera.cx).astype(int)
-        v = np.rint(camera.fy * y / safe + camera.cy).astype(int)
-        inside = front & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        depth = frame.depth[v.clip(0, camera.height - 1), u.clip(0, camera.width - 1)]
-        seen |= inside & (z < depth + SEEN)
+    poses = np.stack([sequence[index].T_world_camera for index in frames])
+    depths = (sequence[index].depth for index in frames)
+    seen = visible_points(points, poses, sequence.intrinsics, depths, tolerance=SEEN)
     return points, seen, tuple(len(axis) for axis in axes)
 
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from warpslam.cli import parse_frames
 from warpslam.errors import WarpSlamError
-from warpslam.sequences import open_sequence
+from warpslam.pipeline import psnr
+from warpslam.sequences import Frame, open_sequence
 from warpslam.slam import Slam
 
 
@@ -35,17 +36,22 @@ def main(arguments: list[str] | None = None) -> int:
     print("frame    mean  median   PSNR  |  mean  median   PSNR")
     for index in range(len(sequence))[options.frames]:
         frame = sequence[index]
-        depth, rgb = frame.depth[::stride, ::stride], frame.rgb[::stride, ::stride] / 255.0
-        valid = depth > 0
-        row = []
-        for guide in (frame.depth, None):
-            image = slam.render(frame.T_world_camera, depth=guide, stride=stride)
-            error = 100 * np.abs(image.depth - depth)[valid]
-            row += [error.mean(), np.median(error), -10 * np.log10(np.mean((image.rgb - rgb) ** 2))]
+        row = [*view_errors(slam, frame, stride, guided=True), *view_errors(slam, frame, stride, guided=False)]
         rows.append(row)
         print(f"{index:5d}  {_text(row)}", flush=True)
     print(f" mean  {_text(np.mean(rows, axis=0))}")
     return 0
+
+
+def view_errors(slam: Slam, frame: Frame, stride: int, *, guided: bool) -> tuple[float, float, float]:
+    """Mean and median depth error [cm] and PSNR [dB] of every `stride`-th pixel of the frame's view.
+
+    `guided`: samples are placed by the frame's depth, else by the map alone.
+    """
+    image = slam.render(frame.T_world_camera, depth=frame.depth if guided else None, stride=stride)
+    depth = frame.depth[::stride, ::stride]
+    error = 100 * np.abs(image.depth - depth)[depth > 0]
+    return float(error.mean()), float(np.median(error)), psnr(image.rgb, frame.rgb[::stride, ::stride])
 
 
 def _text(row) -> str:

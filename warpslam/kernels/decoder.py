@@ -50,7 +50,6 @@ W4 = 297
 BIAS = 329  # b_0..b_4
 FC_BIAS = 334  # d_0..d_4
 V = 339  # V_0..V_4, 32 rows each (fine: 64)
-V_FINE_END = V + 320
 OUT_32 = V + 160  # output weights, then one row of output biases
 OUT_64 = V + 320
 

@@ -120,17 +120,3 @@ def tracking_loss(
         if color_weight > 0.0:
             value += color_weight * l1(measured_rgb[tid], rgb[tid])
         wp.atomic_add(loss, 0, value)
-
-
-@wp.kernel(enable_backward=False)
-def depth_error_sums(
-    inlier: wp.array(dtype=int),
-    measured_depth: wp.array(dtype=float),
-    depth: wp.array(dtype=float),
-    sums: wp.array(dtype=float),
-):
-    """sums[0] += |D - D^| [m], sums[1] += 1, over the inliers: the residual that tells whether tracking holds."""
-    tid = wp.tid()
-    if inlier[tid] != 0:
-        wp.atomic_add(sums, 0, wp.abs(measured_depth[tid] - depth[tid]))
-        wp.atomic_add(sums, 1, 1.0)
