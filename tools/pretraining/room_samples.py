@@ -42,8 +42,8 @@ def make_samples(room: Any, seed: int, sizes: SampleSizes) -> dict[str, np.ndarr
 
     Returns:
         float32 arrays `surface`, `normals`, `colors` (N, 3); `points` (M, 3) with bool `occupied` (M,);
-        `origins` (C, 3), `directions`, `ray_colors` (C, R, 3) and `distances` (C, R) along unit directions, 0 = miss.
-        Colours of rays are those of the nearest sampled surface point.
+        `origins` (C, 3), `directions`, `ray_colors`, `ray_normals` (C, R, 3) and `distances` (C, R) along unit
+        directions, 0 = miss. Colours and normals of rays are those of the nearest sampled surface point.
     """
     rng = np.random.default_rng([seed, 17])
     lower, upper = np.asarray(room.bounds, dtype=np.float64)
@@ -63,7 +63,7 @@ def make_samples(room: Any, seed: int, sizes: SampleSizes) -> dict[str, np.ndarr
     hits = (origins[:, None] + directions * distances[..., None]).reshape(-1, 3)
     from scipy.spatial import cKDTree
 
-    ray_colors = colors[cKDTree(surface).query(hits, workers=1)[1]].reshape(directions.shape)
+    nearest = cKDTree(surface).query(hits, workers=1)[1]
     centre = (lower + upper) / 2
     samples = {
         "surface": surface - centre,
@@ -73,7 +73,8 @@ def make_samples(room: Any, seed: int, sizes: SampleSizes) -> dict[str, np.ndarr
         "origins": origins - centre,
         "directions": directions,
         "distances": distances,
-        "ray_colors": ray_colors,
+        "ray_colors": colors[nearest].reshape(directions.shape),
+        "ray_normals": normals[nearest].reshape(directions.shape),
     }
     samples = {name: np.ascontiguousarray(array, dtype=np.float32) for name, array in samples.items()}
     return samples | {"occupied": np.asarray(room.occupancy(points), dtype=bool)}

@@ -46,6 +46,7 @@ class TrainingConfig:
     crop_size: float = 2.56  # [m], a multiple of every fine and middle spacing
     cloud_size: int = 2500  # surface points that the encoder sees in a crop
     point_count: int = 3000  # labelled points of a crop, half of them near the surface
+    whole_count: int = 2000  # labelled points of a whole room, anywhere in it
     encoder_rate: float = 1e-3  # Adam learning rate of phase 1
     scene_count: int = 12  # rooms that are mapped in one episode of phase 2
     turn_count: int = 2  # of these, how many take a step at a time
@@ -54,7 +55,8 @@ class TrainingConfig:
     finer_share: float = 0.25  # of the other rooms, with half the vertex spacing
     first_share: float = 0.2  # of the rooms, at the learning rates of a run's first frame
     ray_count: int = 160  # rays of a room in one step
-    longest_mapping: int = 60  # iterations of a room in an episode; the shortest has 10
+    longest_mapping: int = 40  # iterations of a room in an episode; the shortest has 10
+    longest_first: int = 160  # the same at the learning rates of a first frame
     mapping_rate: float = 1e-3  # Adam learning rate of the decoders in phase 2, at its start
     mapping_rate_end: float = 3e-5  # and at its end (cosine)
     label_count: int = 1500  # labelled points of a room in one step
@@ -137,9 +139,9 @@ class Trainer:
         batch = {name: torch.cat([crop[name] for crop in crops]) for name in crops[0]}
         scene = {
             name: torch.cat([torch.full((len(crop[name]),), i) for i, crop in enumerate(crops)]).to(self.device)
-            for name in ("cloud", "points", "surface", "whole_cloud", "whole_points")
+            for name in ("cloud", "points", "surface", "whole_cloud", "whole_passed", "whole_points")
         }
-        # The coarse cells are nearly as large as a crop, so that level sees whole rooms.
+        # The coarse cells are nearly as large as a crop, so that level works on whole rooms, of which it sees a part.
         losses, sizes = {}, {}
         features: dict[str, Tensor] = {}
         lattices: dict[str, Lattice] = {}
@@ -153,6 +155,11 @@ class Trainer:
                 batch[cloud], batch[cloud + "_normals"], batch[cloud + "_colors"], scene[cloud], lattices[level]
             )
             sizes[level] = (features[level] / self.encoders[level].scale).square().mean()
+        # A map's vertices that no ray has passed hold nothing yet; what lies there is for the coarse decoder to guess.
+        rows, weights = lattices["coarse"].stencil(batch["whole_passed"], scene["whole_passed"])
+        passed = torch.zeros(len(features["coarse"]), 1, device=self.device)
+        passed[rows[weights > 0]] = 1.0
+        features["coarse"] = features["coarse"] * passed
 
         def look_up(level: str, name: str) -> Tensor:
             return interpolate(features[level], lattices[level].stencil(batch[name], scene[name]))
@@ -303,10 +310,12 @@ class Trainer:
         features = pool.initial_features(self.generator)
         # The first frame of a run is mapped with five times the learning rates. The coarse level has small ones: at the
         # plain rate an episode would leave its features where they are. Its iterations are cheap, and a run has many.
-        factor = 5.0 if coarse or self.rng.random() < self.config.first_share else 1.0
+        first = not coarse and self.rng.random() < self.config.first_share
+        factor = 5.0 if coarse or first else 1.0
+        longest = self.config.longest_first if first else (10 if coarse else 1) * self.config.longest_mapping
         return {
             "coarse": coarse,
-            "iterations": int(self.rng.integers(10, (10 if coarse else 1) * self.config.longest_mapping + 1)),
+            "iterations": int(self.rng.integers(10, longest + 1)),
             "done": 0,
             "losses": {},
             "pool": pool,
@@ -318,7 +327,7 @@ class Trainer:
         }
 
     def _draw_crop(self) -> dict[str, Tensor]:
-        """A box around a surface point of a placed room, with the points in it, and points of the whole room."""
+        """A box around a surface point of a placed room with the points in it, and what some views show of the room."""
         config, rng = self.config, self.rng
         room = self.rooms[rng.integers(len(self.rooms))]
         rotation, shift = random_placement(rng)
@@ -341,7 +350,13 @@ class Trainer:
         chosen = np.concatenate(
             [rng.choice(near, config.point_count // 2), rng.choice(uniform, config.point_count // 2)]
         )
-        whole_cloud, whole = rng.choice(len(surface), config.cloud_size), rng.choice(len(points), 1000)
+        whole = half + rng.choice(len(points) - half, config.whole_count)
+        views = rng.choice(len(room["origins"]), rng.integers(1, len(room["origins"]) // 3 + 1), replace=False)
+        seen = np.argwhere(room["distances"][views] > 0)
+        camera, ray = seen[rng.integers(0, len(seen), config.cloud_size)].T
+        ray = (views[camera], ray)
+        path = room["directions"][ray] * room["distances"][ray][:, None]
+        passed = room["origins"][ray[0]] + rng.random((8, len(path), 1)) * path
         arrays = {
             "cloud": surface[cloud] + rng.normal(0.0, 0.005, (len(cloud), 3)),
             "cloud_normals": normals[cloud],
@@ -351,9 +366,10 @@ class Trainer:
             "surface": surface[shown],
             "surface_colors": room["colors"][shown],
             "box": np.stack([low, low + size]) + np.array([[1e-4], [-1e-4]]),
-            "whole_cloud": surface[whole_cloud],
-            "whole_cloud_normals": normals[whole_cloud],
-            "whole_cloud_colors": room["colors"][whole_cloud],
+            "whole_cloud": place(room["origins"][ray[0]] + path),
+            "whole_cloud_normals": room["ray_normals"][ray] @ rotation.T,
+            "whole_cloud_colors": room["ray_colors"][ray],
+            "whole_passed": place(passed.reshape(-1, 3)),
             "whole_points": points[whole],
             "whole_occupied": room["occupied"][whole],
             "whole_box": np.stack([points.min(axis=0), points.max(axis=0)]),
