@@ -6,6 +6,7 @@ import torch
 import warp as wp
 
 from warpslam.kernels.grid import Vec32
+from warpslam.launching import Launcher
 from warpslam.optimizers import PoseOptimizer, RowOptimizer
 
 DEVICES = ["cpu", *(str(d) for d in wp.get_cuda_devices())]
@@ -19,7 +20,7 @@ def test_rows_follow_torch_adam(device):
     start = rng.normal(size=(20, 32)).astype(np.float32)
     rows = np.array([1, 4, 5, 19])
     x = wp.array(start, dtype=Vec32, device=device)
-    optimizer = RowOptimizer(device)
+    optimizer = RowOptimizer(Launcher(device))
     optimizer.start(20, rows)
     expected = torch.tensor(start[rows], requires_grad=True)
     reference = torch.optim.Adam([expected], lr=1.0)
@@ -43,14 +44,14 @@ def test_poses_follow_torch_adam_and_the_first_stays(device):
     """Separate rates for quaternion and translation; a fixed row does not move."""
     rng = np.random.default_rng(1)
     start = rng.normal(size=(3, 7)).astype(np.float32)
-    optimizer = PoseOptimizer(4, wp.get_device(device))
-    optimizer.begin(start)
+    optimizer = PoseOptimizer(4, Launcher(wp.get_device(device)))
+    optimizer.begin(start, np.array([[0.002, 0.01]]))
     q, t = (torch.tensor(start[1:, part], requires_grad=True) for part in (slice(0, 4), slice(4, 7)))
     reference = torch.optim.Adam([{"params": [q], "lr": 0.002}, {"params": [t], "lr": 0.01}])
     for _ in range(5):
         gradient = rng.normal(size=(3, 7)).astype(np.float32)
         optimizer.poses.grad.assign(gradient)
-        optimizer.update(0.002, 0.01, first=1)
+        optimizer.update(first=1)
         q.grad, t.grad = torch.tensor(gradient[1:, :4]), torch.tensor(gradient[1:, 4:])
         reference.step()
     expected = np.concatenate([q.detach().numpy(), t.detach().numpy()], axis=1)
@@ -63,7 +64,7 @@ def test_a_gradient_that_is_not_finite_is_left_out():
     """Its row keeps its bits and the optimiser says so; the other rows move, and the next step is clean."""
     device = wp.get_device("cpu")
     x = wp.array(np.ones((3, 32), np.float32), dtype=Vec32, device=device)
-    optimizer = RowOptimizer(device)
+    optimizer = RowOptimizer(Launcher(device))
     optimizer.start(3, np.arange(3))
     assert not optimizer.has_rejected
     gradient = np.ones((*optimizer.gradient.shape, 32), np.float32)
@@ -82,7 +83,7 @@ def test_a_new_call_starts_with_fresh_moments():
     """The first step of every call moves by the rate in the direction of the gradient's sign, whatever came before."""
     device = wp.get_device("cpu")
     x = wp.zeros(2, dtype=Vec32, device=device)
-    optimizer = RowOptimizer(device)
+    optimizer = RowOptimizer(Launcher(device))
     for _ in range(2):
         optimizer.start(2, np.array([0]))
         before = x.numpy()[0, 0]

@@ -50,6 +50,12 @@ class SamplingConfig(_Group):
     min_gradient: float = Field(
         3e-5, ge=0, le=0.01, description="smaller derivatives of a ray's depth [m] by a logit are dropped (0 = exact)"
     )
+    min_transmittance: float = Field(
+        1e-4,
+        ge=0,
+        le=0.01,
+        description="a ray ends where less light is left (0 = exact): its depth errs below this x its largest depth",
+    )
 
 
 class TrackingConfig(_Group):

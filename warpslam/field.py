@@ -7,16 +7,15 @@ An optimisation iteration reads
         batch.bound(...); batch.place_samples(...)
         batch.render(arrays, "color", gradients, tape)
         batch.mapping_loss(...)
-    tape.backward(batch.loss)
+    launcher.call(lambda: tape.backward(batch.loss))
 
 `RayBatch.cast` and the losses have generated adjoints; compositing and the decoders have hand-written ones, attached
-with
-`wp.Tape.record_func`.
+with `wp.Tape.record_func`. All launches go through a `warpslam.launching.Launcher`, which can record and replay them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,11 +23,31 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.decoders import DecoderWeights
-from warpslam.kernels import compositing, decoder, losses, rays
+from warpslam.kernels import adam, compositing, decoder, gauss_newton, losses, rays
 from warpslam.kernels.grid import Lattice, Vec32
-from warpslam.launching import decoders_for, launch_points, slice_count
+from warpslam.launching import Launcher, Step, decoders_for, run_slices, slice_count
 
 STAGES = ("coarse", "middle", "fine", "color")
+GROUP_SIZE = {"cpu": 8, "cuda": 16}
+"""Samples of a ray between two looks at its transmittance."""
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Work that is skipped; zeros are exact.
+
+    min_weight: Samples that weigh less get no colour: rgb errs by less than samples * min_weight.
+    min_gradient: Derivatives of the loss by a logit up to this are dropped.
+    min_transmittance: A ray ends where less is left: depth errs by less than this * z_max, and rgb by less than this *
+        the brightest colour.
+    """
+
+    min_weight: float = 0.0
+    min_gradient: float = 0.0
+    min_transmittance: float = 0.0
+
+
+EXACT = Thresholds()
 
 
 class PackedDecoder:
@@ -167,8 +186,9 @@ class RayBatch:
     """Device arrays of up to ``capacity`` rays with up to ``max_samples`` samples each, and the stages that fill them.
     """
 
-    def __init__(self, capacity: int, max_samples: int, device: wp.Device) -> None:
+    def __init__(self, capacity: int, max_samples: int, device: wp.Device, launcher: Launcher | None = None) -> None:
         self.capacity, self.max_samples, self.device = capacity, max_samples, device
+        self.launcher = launcher or Launcher(device)
         self.kernels = decoders_for(device)
         self.count = 0
         self.sample_count = 0
@@ -185,6 +205,9 @@ class RayBatch:
         self.direction = zeros(capacity, wp.vec3, True)
         self.t_exit = zeros(capacity)
         self.keep = zeros(capacity, int)
+        self.transmittance = zeros(capacity)
+        self.seeds = zeros(1, int)
+        self.iteration = zeros(1, int)
         self.z = zeros(points)
         self.logit = zeros(points)
         self.color = zeros(points, wp.vec3)
@@ -210,8 +233,20 @@ class RayBatch:
         empty = wp.zeros((1, 1), dtype=Vec32, device=device)
         self._no_rows, self._no_selection = empty, wp.zeros(1, dtype=wp.uint8, device=device)
         self._activations = self._layer_grad = empty
+        self._motion: _MotionArrays | None = None
 
     # -- filling in the rays -------------------------------------------------------------------------------------
+
+    def set_seeds(self, seeds: Sequence[int]) -> None:
+        """Seeds of the iterations to come, int32; `next_iteration` moves on to the next one."""
+        if len(seeds) > self.seeds.shape[0]:
+            self.seeds = wp.zeros(2 * len(seeds), dtype=int, device=self.device)
+        self.seeds[: len(seeds)].assign(np.asarray(seeds, np.int32))
+        self.iteration.zero_()
+
+    def next_iteration(self) -> None:
+        """Use the next seed."""
+        self.launcher.launch(adam.advance_step, 1, [self.iteration])
 
     def draw(
         self,
@@ -220,7 +255,6 @@ class RayBatch:
         rays_per_frame: int,
         camera: Intrinsics,
         *,
-        seed: int,
         edge_u: int = 0,
         edge_v: int = 0,
     ) -> None:
@@ -228,23 +262,16 @@ class RayBatch:
         """
         self.count = window.shape[0] * rays_per_frame
         rgb, depth, scale = images
-        self._launch(
-            rays.draw_pixels,
-            self.count,
-            [seed, rays_per_frame, window, edge_u, edge_v, *_camera_vectors(camera), rgb, depth, scale],
-            [self.frame, self.direction_camera, self.measured_depth, self.measured_rgb],
-        )
+        inputs = [self.seeds, self.iteration, rays_per_frame, window, edge_u, edge_v, *_camera_vectors(camera)]
+        inputs += [rgb, depth, scale, self.frame, self.direction_camera, self.measured_depth, self.measured_rgb]
+        self.launcher.launch(rays.draw_pixels, self.count, inputs)
 
     def set_pixels(self, first_row: int, row_count: int, camera: Intrinsics, stride: int = 1) -> None:
         """All pixels of ``row_count`` rows of an image that takes every ``stride``-th pixel."""
         width = -(-camera.width // stride)
         self.count = row_count * width
-        self._launch(
-            rays.grid_pixels,
-            self.count,
-            [first_row, width, stride, *_camera_vectors(camera)],
-            [self.frame, self.direction_camera],
-        )
+        inputs = [first_row, width, stride, *_camera_vectors(camera), self.frame, self.direction_camera]
+        self.launcher.launch(rays.grid_pixels, self.count, inputs)
 
     def set_points(self, points: np.ndarray) -> None:
         """Query points, shape (N, 3) [m], as rays of one sample at z = 0."""
@@ -255,74 +282,43 @@ class RayBatch:
         self.z.zero_()
         self.keep.fill_(1)
 
-    def cast(self, poses: wp.array) -> None:
+    def cast(self, poses: wp.array, *, differentiate: bool = True) -> None:
         """Rays of the pixels for pose vectors ``poses``, shape (frames, 7); recorded on an active tape."""
-        wp.launch(
-            rays.cast_rays,
-            dim=self.count,
-            inputs=[poses, self.frame, self.direction_camera],
-            outputs=[self.origin, self.direction],
-            device=self.device,
-            record_tape=poses.requires_grad,
-        )
+        inputs, outputs = [poses, self.frame, self.direction_camera], [self.origin, self.direction]
+        if differentiate and poses.requires_grad:
+            self.launcher.launch_taped(rays.cast_rays, self.count, inputs, outputs)
+        else:
+            self.launcher.launch(rays.cast_rays, self.count, inputs + outputs)
 
     def bound(self, arrays: FieldArrays, *, use_depth: bool = True) -> None:
         """Exit distances and the rays to keep (a measured surface outside the bound drops its ray)."""
-        self.max_depth.zero_()
-        self._launch(
-            rays.bound_rays,
-            self.count,
-            [arrays.low, arrays.high, self.origin, self.direction, self.measured_depth, int(use_depth)],
-            [self.t_exit, self.keep, self.max_depth],
-        )
+        self.launcher.call(self.max_depth.zero_)
+        inputs = [arrays.low, arrays.high, self.origin, self.direction, self.measured_depth, int(use_depth)]
+        self.launcher.launch(rays.bound_rays, self.count, [*inputs, self.t_exit, self.keep, self.max_depth])
 
-    def place_samples(
-        self, stratified: int, surface: int, *, use_depth: bool = True, jitter: bool = False, seed: int = 0
-    ) -> None:
+    def place_samples(self, stratified: int, surface: int, *, use_depth: bool = True, jitter: bool = False) -> None:
         """Depths of the samples along each kept ray, ascending."""
         self.sample_count = stratified + (surface if use_depth else 0)
-        self._launch(
-            rays.place_samples,
-            self.count,
-            [seed, int(jitter), stratified, self.sample_count - stratified, int(use_depth)]
-            + [self.measured_depth, self.t_exit, self.keep, self.max_depth],
-            [self.z],
-        )
+        inputs = [self.seeds, self.iteration, int(jitter), stratified, self.sample_count - stratified, int(use_depth)]
+        inputs += [self.measured_depth, self.t_exit, self.keep, self.max_depth, self.z]
+
+        def steps(first: int, stop: int, slot: int) -> list[Step]:
+            return [(rays.place_samples, stop - first, [first, *inputs])]
+
+        self.launcher.slices(self.count, steps)
 
     # -- the field -----------------------------------------------------------------------------------------------
 
     def query(self, arrays: FieldArrays, stage: str) -> None:
         """Logit (and colour, in the colour stage) of every sample: `logit`, `color`."""
-        kernels, points = self.kernels, self.count * self.sample_count
-        sample = [32, self.sample_count, self.origin, self.direction, self.z, self.keep]
 
-        def grid(level: str) -> list:
-            return [arrays.lattices[level], arrays.features[level]]
+        def steps(first: int, stop: int, slot: int) -> list[Step]:
+            result = [self._start(first, stop), *self._logits(arrays, stage, first, stop, 0, self.sample_count, EXACT)]
+            if stage == "color":
+                result.append(self._colors(arrays, first, stop, 0.0))
+            return result
 
-        def weights(level: str) -> list:
-            return [arrays.decoders[level].weights, self.bits[level]]
-
-        if stage == "coarse":
-            self._points(kernels.coarse_forward, points, [*sample, *grid("coarse"), *weights("coarse"), self.logit])
-            return
-        self._points(kernels.middle_forward, points, [*sample, *grid("middle"), *weights("middle"), self.logit])
-        if stage in ("fine", "color"):
-            inputs = [*sample, *grid("fine"), *grid("middle"), *weights("fine"), self.logit]
-            self._points(kernels.fine_forward, points, inputs)
-        if stage == "color":
-            self._query_color(arrays)
-
-    def _query_color(self, arrays: FieldArrays, min_weight: float = 0.0, *, want_activations: bool = False) -> None:
-        points = self.count * self.sample_count
-        if want_activations and self._activations.shape[0] < points:
-            size = self.capacity * self.max_samples
-            self._activations = wp.empty((size, 5), dtype=Vec32, device=self.device)
-            if self.kernels.sums_weights_apart:
-                self._layer_grad = wp.empty((size, 10), dtype=Vec32, device=self.device)
-        inputs = [32, self.sample_count, self.origin, self.direction, self.z, self.keep, arrays.lattices["color"]]
-        inputs += [arrays.features["color"], arrays.decoders["color"].weights, self.bits["color"]]
-        inputs += [int(want_activations), self._activations, self.weight, min_weight, self.color]
-        self._points(self.kernels.color_forward, points, inputs)
+        self.launcher.slices(self.count, steps)
 
     def render(
         self,
@@ -331,186 +327,239 @@ class RayBatch:
         gradients: Gradients | None = None,
         tape: wp.Tape | None = None,
         *,
-        min_weight: float = 0.0,
-        min_gradient: float = 0.0,
+        thresholds: Thresholds = EXACT,
     ) -> None:
         """Depth, colour and variance of every ray (Eq. 5-7).
 
         gradients, tape: What to differentiate, and the tape that gets the adjoint; both or neither.
-        min_weight: Samples that weigh less get no colour; the colour of a ray errs by less than samples * min_weight.
-        min_gradient: Derivatives of the loss by a logit up to this are dropped. 0 and 0 are exact.
         """
-        want_weights = gradients is not None and gradients.color_weights is not None
-        self.query(arrays, "fine" if stage == "color" else stage)
-        self._launch(
-            compositing.composite,
-            self.count,
-            [self.sample_count, arrays.low, arrays.high, self.origin, self.direction, self.z, self.keep, self.logit],
-            [self.weight, self.depth, self.variance],
-        )
-        if stage == "color":
-            self._query_color(arrays, min_weight, want_activations=want_weights)
-            inputs = [self.sample_count, self.keep, self.color, self.weight]
-            self._launch(compositing.composite_color, self.count, inputs, [self.rgb])
-        else:
-            self.rgb.zero_()
-        if gradients is not None:
-            if tape is None:
-                raise ValueError("gradients are recorded on a tape: pass the active one")
-            tape.record_func(
-                lambda: self._backward(arrays, stage, gradients, min_weight, min_gradient), [self.depth, self.rgb]
-            )
+        if gradients is not None and tape is None:
+            raise ValueError("gradients are recorded on a tape: pass the active one")
+        want_activations = gradients is not None and gradients.color_weights is not None
+        if want_activations:
+            self._make_room_for_activations()
+        samples = self.sample_count
+        width = GROUP_SIZE["cuda" if self.device.is_cuda else "cpu"] if thresholds.min_transmittance > 0 else samples
+
+        def steps(first: int, stop: int, slot: int) -> list[Step]:
+            ray_count = stop - first
+            result = [self._start(first, stop)]
+            for sample in range(0, samples, width):
+                group = min(width, samples - sample)
+                result += self._logits(arrays, stage, first, stop, sample, group, thresholds)
+                inputs = [first, sample, group, samples, thresholds.min_transmittance, arrays.low, arrays.high]
+                inputs += [self.origin, self.direction, self.z, self.logit, self.weight, self.transmittance, self.depth]
+                result.append((compositing.composite, ray_count, inputs))
+            inputs = [first, samples, self.z, self.keep, self.weight, self.depth, self.variance]
+            result.append((compositing.ray_variance, ray_count, inputs))
+            if stage == "color":
+                result.append(self._colors(arrays, first, stop, thresholds.min_weight, want_activations))
+                inputs = [first, samples, self.keep, self.color, self.weight, self.rgb]
+                result.append((compositing.composite_color, ray_count, inputs))
+            return result
+
+        self.launcher.slices(self.count, steps)
+        if gradients is not None and tape is not None:
+            tape.record_func(self._adjoint(arrays, stage, gradients, thresholds), [self.depth, self.rgb])
 
     def take_surface_depth(self, min_occupancy: float) -> None:
         """After `render`: replace the mean depth of each ray by that of its first sample with ``min_occupancy``."""
-        inputs = [self.sample_count, self.keep, self.z, self.logit, self.weight, min_occupancy]
-        self._launch(compositing.surface_depth, self.count, inputs, [self.depth])
+        inputs = [self.sample_count, self.keep, self.z, self.logit, self.weight, min_occupancy, self.depth]
+        self.launcher.launch(compositing.surface_depth, self.count, inputs)
 
-    def _backward(
-        self, arrays: FieldArrays, stage: str, gradients: Gradients, min_weight: float, min_gradient: float
-    ) -> None:
-        kernels, points = self.kernels, self.count * self.sample_count
-        with_color = int(stage == "color")
-        self._launch(
-            compositing.composite_backward,
-            self.count,
-            [self.sample_count, self.z, self.keep, self.logit, with_color, self.color, self.weight, min_weight],
-            [self.depth.grad, self.rgb.grad, self.logit_grad, self.color_grad],
-        )
-        sample = [32, self.sample_count, self.origin, self.direction, self.z]
-        want_points = int(gradients.points)
+    def _start(self, first: int, stop: int) -> Step:
+        inputs = [first, self.keep, self.transmittance, self.depth, self.variance, self.rgb]
+        return (compositing.start_rays, stop - first, inputs)
 
-        def grid_gradient(level: str) -> list:
-            wanted = gradients.grids.get(level)
-            if wanted is None:
-                return [0, self._no_selection, self._no_rows]
-            return [1, wanted.selected, wanted.buffers]
+    def _logits(
+        self, arrays: FieldArrays, stage: str, first: int, stop: int, sample: int, width: int, thresholds: Thresholds
+    ) -> list[Step]:
+        """Occupancy logits of some samples of the rays ``first`` to ``stop``."""
+        kernels, dim = self.kernels, (stop - first) * width
+        points = [first, sample, width, 32, self.sample_count, self.origin, self.direction, self.z]
+        points += [self.transmittance, thresholds.min_transmittance]
 
-        def common(level: str) -> list:
-            packed = arrays.decoders[level]
-            return [*sample, arrays.lattices[level], arrays.features[level], packed.weights, packed.transposed]
+        def grid(level: str) -> list:
+            return [arrays.lattices[level], arrays.features[level]]
+
+        def rest(level: str) -> list:
+            return [arrays.decoders[level].weights, self.bits[level], self.logit]
 
         if stage == "coarse":
-            packed = arrays.decoders["coarse"]
-            inputs = [*sample, arrays.lattices["coarse"], packed.weights, packed.transposed, self.bits["coarse"]]
-            inputs += [self.logit_grad, *grid_gradient("coarse")[1:]]
-            self._points(kernels.coarse_backward, points, inputs, with_slot=True)
-            return
-        levels = ("middle",) if stage == "middle" else ("middle", "fine")
-        for level in levels:
-            if gradients.points or level in gradients.grids:
-                output = decoder.OUT_64 if level == "fine" else decoder.OUT_32
-                inputs = [*common(level), output, self.bits[level], self.logit_grad, min_gradient]
-                inputs += [*grid_gradient(level), want_points, self.point_grad]
-                self._points(kernels.geometry_backward, points, inputs, with_slot=True)
+            return [(kernels.coarse_forward, dim, [*points, *grid("coarse"), *rest("coarse")])]
+        steps: list[Step] = [(kernels.middle_forward, dim, [*points, *grid("middle"), *rest("middle")])]
+        if stage != "middle":
+            steps.append((kernels.fine_forward, dim, [*points, *grid("fine"), *grid("middle"), *rest("fine")]))
+        return steps
+
+    def _colors(
+        self, arrays: FieldArrays, first: int, stop: int, min_weight: float, want_activations: bool = False
+    ) -> Step:
+        # Rays that ended early have weights, too: only those that are not kept (transmittance -1) get no colour.
+        inputs = [first, 0, self.sample_count, 32, self.sample_count, self.origin, self.direction, self.z]
+        inputs += [self.transmittance, 0.0, arrays.lattices["color"], arrays.features["color"]]
+        inputs += [arrays.decoders["color"].weights, self.bits["color"], int(want_activations), self._activations]
+        inputs += [self.weight, min_weight, self.color]
+        return (self.kernels.color_forward, (stop - first) * self.sample_count, inputs)
+
+    def _make_room_for_activations(self) -> None:
+        size = self.capacity * self.max_samples
+        if self._activations.shape[0] < size:
+            self._activations = wp.empty((size, 5), dtype=Vec32, device=self.device)
+            if self.kernels.sums_weights_apart:
+                self._layer_grad = wp.empty((size, 10), dtype=Vec32, device=self.device)
+
+    def _adjoint(
+        self, arrays: FieldArrays, stage: str, gradients: Gradients, thresholds: Thresholds
+    ) -> Callable[[], None]:
+        """The backward pass of `render` as a function that replays its launches."""
+        samples = self.sample_count
         want_weights = gradients.color_weights is not None
-        if stage == "color" and (gradients.points or want_weights or "color" in gradients.grids):
-            buffers = gradients.color_weights if want_weights else self._no_rows
-            inputs = [*common("color"), self.bits["color"], self.color_grad, *grid_gradient("color")]
-            inputs += [want_points, self.point_grad, int(want_weights), self._activations, buffers, self._layer_grad]
-            self._points(kernels.color_backward, points, inputs, with_slot=True)
-            if want_weights and kernels.sums_weights_apart:
-                chunk = 256
-                self._launch(
-                    kernels.color_weights,
-                    (-(-points // chunk), decoder.COLOR_WEIGHT_ROWS),
-                    [points, chunk, *common("color"), self._activations, self.color_grad, self._layer_grad],
-                    [buffers],
-                )
-        if gradients.points:
-            self._launch(
-                rays.collect_ray_gradients,
-                self.count,
-                [self.sample_count, self.keep, self.z, self.point_grad],
-                [self.origin.grad, self.direction.grad],
-            )
+
+        def steps(first: int, stop: int, slot: int) -> list[Step]:
+            inputs = [first, samples, self.z, self.keep, self.logit, int(stage == "color"), self.color, self.weight]
+            inputs += [thresholds.min_weight, self.depth.grad, self.rgb.grad, self.logit_grad, self.color_grad]
+            result: list[Step] = [(compositing.composite_backward, stop - first, inputs)]
+            levels = {"coarse": ("coarse",), "middle": ("middle",)}.get(stage, ("middle", "fine"))
+            for level in levels:
+                if gradients.points or level in gradients.grids:
+                    result.append(
+                        self._geometry_adjoint(
+                            arrays, level, gradients, first, stop, slot, thresholds.min_gradient, self.point_grad
+                        )
+                    )
+            if stage == "color" and (gradients.points or want_weights or "color" in gradients.grids):
+                result.append(self._color_adjoint(arrays, gradients, first, stop, slot, self.point_grad))
+            if gradients.points:
+                inputs = [first, samples, self.keep, self.z, self.point_grad, self.origin.grad, self.direction.grad]
+                result.append((rays.collect_ray_gradients, stop - first, inputs))
+            return result
+
+        commands = self.launcher.slice_commands(self.count, steps)
+        last: list[wp.Launch] = []
+        if want_weights and stage == "color" and self.kernels.sums_weights_apart:
+            chunk, points = 256, self.count * samples
+            inputs = [points, chunk, *self._common(arrays, "color"), self._activations, self.color_grad]
+            inputs += [self._layer_grad, gradients.color_weights]
+            dim = (-(-points // chunk), decoder.COLOR_WEIGHT_ROWS)
+            last.append(self.launcher.command(self.kernels.color_weights, dim, inputs))
+
+        def run() -> None:
+            run_slices(commands)
+            for command in last:
+                command.launch()
+
+        return run
+
+    def _common(self, arrays: FieldArrays, level: str) -> list:
+        packed = arrays.decoders[level]
+        points = [32, self.sample_count, self.origin, self.direction, self.z]
+        return [*points, arrays.lattices[level], arrays.features[level], packed.weights, packed.transposed]
+
+    def _grid_gradient(self, gradients: Gradients, level: str) -> list:
+        wanted = gradients.grids.get(level)
+        if wanted is None:
+            return [0, self._no_selection, self._no_rows]
+        return [1, wanted.selected, wanted.buffers]
+
+    def _geometry_adjoint(
+        self,
+        arrays: FieldArrays,
+        level: str,
+        gradients: Gradients,
+        first: int,
+        stop: int,
+        slot: int,
+        min_gradient: float,
+        point_grad: wp.array,
+    ) -> Step:
+        samples = self.sample_count
+        head, dim = [first * samples, slot], (stop - first) * samples
+        if level == "coarse":
+            packed = arrays.decoders["coarse"]
+            inputs = [*head, 32, samples, self.origin, self.direction, self.z, arrays.lattices["coarse"]]
+            inputs += [packed.weights, packed.transposed, self.bits["coarse"], self.logit_grad]
+            return (self.kernels.coarse_backward, dim, inputs + self._grid_gradient(gradients, "coarse")[1:])
+        output = decoder.OUT_64 if level == "fine" else decoder.OUT_32
+        inputs = [*head, *self._common(arrays, level), output, self.bits[level], self.logit_grad, min_gradient]
+        inputs += [*self._grid_gradient(gradients, level), int(gradients.points), point_grad]
+        return (self.kernels.geometry_backward, dim, inputs)
+
+    def _color_adjoint(
+        self, arrays: FieldArrays, gradients: Gradients, first: int, stop: int, slot: int, point_grad: wp.array
+    ) -> Step:
+        samples = self.sample_count
+        buffers = self._no_rows if gradients.color_weights is None else gradients.color_weights
+        inputs = [first * samples, slot, *self._common(arrays, "color"), self.bits["color"], self.color_grad]
+        inputs += [*self._grid_gradient(gradients, "color"), int(gradients.points), point_grad]
+        inputs += [int(gradients.color_weights is not None), self._activations, buffers, self._layer_grad]
+        return (self.kernels.color_backward, (stop - first) * samples, inputs)
 
     # -- losses --------------------------------------------------------------------------------------------------
 
     def mapping_loss(self, color_weight: float, depth_weight: float = 1.0) -> None:
         """Eq. 8-10; `loss` holds the sum. Recorded on an active tape."""
-        self.loss.zero_()
-        wp.launch(
-            losses.mapping_loss,
-            dim=self.count,
-            inputs=[
-                self.keep,
-                self.measured_depth,
-                self.measured_rgb,
-                depth_weight,
-                color_weight,
-                self.depth,
-                self.rgb,
-            ],
-            outputs=[self.loss],
-            device=self.device,
-        )
+        self.launcher.call(self.loss.zero_)
+        inputs = [self.keep, self.measured_depth, self.measured_rgb, depth_weight, color_weight, self.depth, self.rgb]
+        self.launcher.launch_taped(losses.mapping_loss, self.count, inputs, [self.loss])
 
     def choose_inliers(self, filter_factor: float, *, median_includes_missing: bool = False) -> None:
         """Normalised residuals, their median and the inliers (Sec. 3.3, dynamic objects)."""
-        self.counts.zero_()
-        self._launch(
-            losses.tracking_residuals,
-            self.count,
-            [self.keep, self.measured_depth, self.depth, self.variance, int(median_includes_missing)],
-            [self.sigma, self.residual, self.counts],
-        )
+        launch = self.launcher.launch
+        self.launcher.call(self.counts.zero_)
+        inputs = [self.keep, self.measured_depth, self.depth, self.variance, int(median_includes_missing)]
+        launch(losses.tracking_residuals, self.count, [*inputs, self.sigma, self.residual, self.counts])
         if filter_factor > 0.0:
-            residual = self.residual[: self.count]
-            self._launch(losses.lower_median, self.count, [residual, self.counts], [self.median])
-        self._launch(
-            losses.choose_inliers,
-            self.count,
-            [self.keep, self.measured_depth, self.residual, self.median, filter_factor],
-            [self.inlier, self.counts[1:]],
-        )
+            launch(losses.lower_median, self.count, [self.residual[: self.count], self.counts, self.median])
+        inputs = [self.keep, self.measured_depth, self.residual, self.median, filter_factor]
+        launch(losses.choose_inliers, self.count, [*inputs, self.inlier, self.counts[1:]])
 
     def tracking_loss(self, color_weight: float) -> None:
         """Eq. 11-12 over the inliers; `loss` holds the sum. Recorded on an active tape."""
-        self.loss.zero_()
-        wp.launch(
-            losses.tracking_loss,
-            dim=self.count,
-            inputs=[self.inlier, self.measured_depth, self.measured_rgb, self.sigma, 1.0, color_weight]
-            + [self.depth, self.rgb],
-            outputs=[self.loss],
-            device=self.device,
-        )
+        self.launcher.call(self.loss.zero_)
+        inputs = [self.inlier, self.measured_depth, self.measured_rgb, self.sigma, 1.0, color_weight]
+        self.launcher.launch_taped(losses.tracking_loss, self.count, [*inputs, self.depth, self.rgb], [self.loss])
 
-    def pose_jacobians(
-        self, arrays: FieldArrays, *, min_weight: float = 0.0, min_gradient: float = 0.0
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivative of every ray's depth and grey value by a motion of the camera, each float32 (rays, 6), after
-        `render`.
-
-        Motion: translation (world), then rotation about the camera centre (world axes): o' = o + t, d' = d + w x d.
+    def gauss_newton_step(
+        self, arrays: FieldArrays, poses: wp.array, color_weight: float, *, thresholds: Thresholds = EXACT
+    ) -> None:
+        """After `render` in the colour stage and `choose_inliers`: one step on the first pose vector, which is the only
+        one that rays may have; see `warpslam.kernels.gauss_newton`.
         """
-        result = []
-        wanted = Gradients(points=True)
-        for depth_seed, rgb_seed in ((1.0, wp.vec3()), (0.0, wp.vec3(1.0 / 3.0, 1.0 / 3.0, 1.0 / 3.0))):
-            self.depth.grad.fill_(depth_seed)
-            self.rgb.grad.fill_(rgb_seed)
-            self.origin.grad.zero_()
-            self.direction.grad.zero_()
-            self._backward(arrays, "color", wanted, min_weight, min_gradient)
-            by_origin = self.origin.grad.numpy()[: self.count]
-            by_direction = self.direction.grad.numpy()[: self.count]
-            turned = np.cross(self.direction.numpy()[: self.count], by_direction)
-            result.append(np.concatenate([by_origin, turned], axis=1))
-        # The tape's adjoints add to these.
-        self.depth.grad.zero_()
-        self.rgb.grad.zero_()
-        self.origin.grad.zero_()
-        self.direction.grad.zero_()
-        return result[0], result[1]
+        if self._motion is None:
+            self._motion = _MotionArrays(self.capacity, self.capacity * self.max_samples, self.device)
+        motion, samples, wanted = self._motion, self.sample_count, Gradients(points=True)
 
-    # -- launching -----------------------------------------------------------------------------------------------
+        def steps(first: int, stop: int, slot: int) -> list[Step]:
+            inputs = [first, samples, self.z, self.inlier, self.logit, self.color, self.weight]
+            inputs += [thresholds.min_weight, thresholds.min_gradient, motion.by_logit]
+            result: list[Step] = [
+                (gauss_newton.ray_derivatives, stop - first, [*inputs, self.logit_grad, self.color_grad])
+            ]
+            for level in ("middle", "fine"):
+                adjoint = self._geometry_adjoint(arrays, level, wanted, first, stop, slot, 0.0, self.point_grad)
+                result.append(adjoint)
+            result.append(self._color_adjoint(arrays, wanted, first, stop, slot, motion.grey_by_point))
+            inputs = [first, samples, self.z, self.direction, motion.by_logit, self.point_grad, motion.grey_by_point]
+            result.append((gauss_newton.ray_jacobians, stop - first, [*inputs, motion.depth, motion.grey]))
+            return result
 
-    def _launch(self, kernel: wp.Kernel, dim, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, record_tape=False)
+        self.launcher.slices(self.count, steps)
+        inputs = [self.count, color_weight, self.inlier, self.sigma, self.measured_depth, self.measured_rgb]
+        inputs += [self.depth, self.rgb, motion.depth, motion.grey, motion.normal, motion.right, poses]
+        self.launcher.launch(gauss_newton.gauss_newton_step, 1, inputs)
 
-    def _points(self, kernel: wp.Kernel, count: int, inputs: list, *, with_slot: bool = False) -> None:
-        launch_points(kernel, count, inputs, self.device, with_slot=with_slot)
+
+class _MotionArrays:
+    """Derivatives of rays by a motion of the camera, and the normal equations."""
+
+    def __init__(self, ray_count: int, point_count: int, device: wp.Device) -> None:
+        self.by_logit = wp.zeros(point_count, dtype=wp.vec2, device=device)
+        self.grey_by_point = wp.zeros(point_count, dtype=wp.vec3, device=device)
+        self.depth = wp.zeros(ray_count, dtype=gauss_newton.Vec6, device=device)
+        self.grey = wp.zeros(ray_count, dtype=gauss_newton.Vec6, device=device)
+        self.normal = wp.zeros(1, dtype=gauss_newton.Mat66d, device=device)
+        self.right = wp.zeros(1, dtype=gauss_newton.Vec6d, device=device)
 
 
 def gradient_buffers(row_count: int, device: wp.Device) -> wp.array:

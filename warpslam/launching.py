@@ -1,28 +1,33 @@
-"""Launching Warp kernels: all CPU cores for the point kernels, and when kernels are compiled.
+"""Launching Warp kernels: all CPU cores, launches recorded once and replayed, and when kernels are compiled.
 
-Warp runs a CPU kernel on the calling thread and releases the GIL meanwhile. Point kernels therefore run in equal
-slices, one a
-thread; those that add up gradients get a buffer (``slot``) for each slice, since atomics are not atomic on the CPU.
-The number of
-slices is fixed, so that sums are formed in the same order in every run.
+Warp runs a CPU kernel on the calling thread and releases the GIL meanwhile. Kernels over rays and their samples
+therefore run in equal slices of the rays, one a thread; those that add up gradients get a buffer (``slot``) for each
+slice, since atomics are not atomic on the CPU. The number of slices is fixed, so that sums are formed in the same
+order in every run.
 """
 
 from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import lru_cache, partial
+from typing import Any
 
 import warp as wp
 
-from warpslam.kernels import adam, compositing, decoder, frustum, grid, losses, rays
+from warpslam.kernels import adam, compositing, decoder, frustum, gauss_newton, grid, losses, rays
 
 MAX_SLICES = 8
 
+Step = tuple[wp.Kernel, Any, list]
+"""A kernel, its dimensions and its arguments."""
+
 
 def slice_count(device: wp.Device) -> int:
-    """Slices of a point kernel, which is also the number of gradient buffers: the CPU's cores (at most 8), 1 on CUDA.
+    """Slices of a launch over rays, which is also the number of gradient buffers: the CPU's cores (at most 8), 1 on
+    CUDA.
     """
     if device.is_cuda:
         return 1
@@ -36,24 +41,135 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=MAX_SLICES - 1, thread_name_prefix="warpslam")
 
 
-def launch_points(kernel: wp.Kernel, count: int, inputs: list, device: wp.Device, *, with_slot: bool = False) -> None:
-    """Launch ``kernel(start, [slot,] *inputs)`` over ``count`` points, cut in slices on the CPU."""
-    slices = slice_count(device)
-    bounds = [count * n // slices for n in range(slices + 1)]
+class Launcher:
+    """Launches kernels on a device, and records the iterations that are repeated (`iterate`) for replay.
 
-    def run(n: int) -> None:
-        start, stop = bounds[n], bounds[n + 1]
-        if stop > start:
-            head = [start, n] if with_slot else [start]
-            wp.launch(kernel, dim=stop - start, inputs=head + inputs, device=device, record_tape=False)
+    Recording does not suspend execution: the first iteration of a kind runs while it is recorded.
+    """
 
-    if slices == 1:
-        run(0)
-        return
-    others = [_pool().submit(run, n) for n in range(1, slices)]
-    run(0)
-    for other in others:
+    def __init__(self, device: wp.Device) -> None:
+        self.device = device
+        self._program: Program | None = None
+        self._kinds: dict[str, tuple[tuple, Program]] = {}
+
+    def iterate(self, kind: str, uses: tuple, iteration: Callable[[], None]) -> None:
+        """One iteration of a kind: recorded when it runs for the first time, and replayed from then on.
+
+        uses: What the iteration depends on and keeps its identity (arrays) or value (numbers) as long as the record
+            holds; with another one it is recorded anew.
+        """
+        known = self._kinds.get(kind)
+        if known is not None and _same(known[0], uses):
+            known[1].run()
+            return
+        program = Program(self.device)
+        self._program = program
+        try:
+            iteration()
+        finally:
+            self._program = None
+        self._kinds[kind] = uses, program
+
+    def forget(self) -> None:
+        """Drop all records."""
+        self._kinds.clear()
+
+    def launch(self, kernel: wp.Kernel, dim: Any, inputs: list) -> None:
+        """One launch over ``dim`` threads."""
+        self.call(self.command(kernel, dim, inputs).launch)
+
+    def launch_taped(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
+        """A launch whose generated adjoint goes to the active `wp.Tape`, if there is one."""
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+        if self._program is not None:
+            self._program.add(self.command(kernel, dim, inputs + outputs).launch)
+
+    def slices(self, count: int, steps: Callable[[int, int, int], list[Step]]) -> None:
+        """Launches that work on rays (or rows) apart: ``steps(first, stop, slot)`` for each slice of ``count``."""
+        commands = self.slice_commands(count, steps)
+        run_slices(commands)
+        if self._program is not None:
+            self._program.add_slices(commands)
+
+    def slice_commands(self, count: int, steps: Callable[[int, int, int], list[Step]]) -> list[list[wp.Launch]]:
+        """The commands of `slices` without running them."""
+        number = slice_count(self.device)
+        bounds = [count * n // number for n in range(number + 1)]
+        return [
+            [self.command(*step) for step in steps(first, stop, slot)]
+            if stop > first
+            else []
+            for slot, (first, stop) in enumerate(zip(bounds[:-1], bounds[1:], strict=True))
+        ]
+
+    def call(self, function: Callable[[], Any]) -> None:
+        """Call something without arguments, such as `wp.array.zero_` or the backward pass of a tape."""
+        function()
+        if self._program is not None:
+            self._program.add(function)
+
+    def command(self, kernel: wp.Kernel, dim: Any, inputs: list) -> wp.Launch:
+        """A launch that has not happened yet."""
+        return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True, record_tape=False)
+
+
+class Program:
+    """An iteration recorded by a `Launcher`: `run` replays it; on CUDA as one graph, captured at the first replay."""
+
+    def __init__(self, device: wp.Device) -> None:
+        self.device = device
+        self._steps: list[Callable[[], Any]] = []
+        self._slices: list[list[wp.Launch]] | None = None
+        self._graph: Any = None
+
+    def add(self, step: Callable[[], Any]) -> None:
+        """Append a call."""
+        self._steps.append(step)
+        self._slices = None
+
+    def add_slices(self, commands: list[list[wp.Launch]]) -> None:
+        """Append launches by slice; those that follow one another directly need no common end."""
+        if self._slices is not None:
+            for mine, more in zip(self._slices, commands, strict=True):
+                mine.extend(more)
+            return
+        self._slices = [list(part) for part in commands]
+        self._steps.append(partial(run_slices, self._slices))
+
+    def run(self) -> None:
+        """Once more."""
+        if not self.device.is_cuda:
+            self._replay()
+            return
+        if self._graph is None:
+            with wp.ScopedCapture(self.device) as capture:
+                self._replay()
+            self._graph = capture.graph
+        wp.capture_launch(self._graph)
+
+    def _replay(self) -> None:
+        for step in self._steps:
+            step()
+
+
+def _same(a: tuple, b: tuple) -> bool:
+    if len(a) != len(b):
+        return False
+    return all(x is y or (isinstance(x, int | float | str) and x == y) for x, y in zip(a, b, strict=True))
+
+
+def run_slices(commands: list[list[wp.Launch]]) -> None:
+    """Each slice's launches in order, the slices side by side."""
+    first, *others = commands
+    waiting = [_pool().submit(_run_all, part) for part in others]
+    _run_all(first)
+    for other in waiting:
         other.result()
+
+
+def _run_all(commands: list[wp.Launch]) -> None:
+    for command in commands:
+        command.launch()
 
 
 def decoders_for(device: wp.Device):
@@ -66,7 +182,7 @@ def compile_kernels(device: wp.Device) -> float:
     took.
     """
     start = time.perf_counter()
-    names = [module.__name__ for module in (adam, compositing, frustum, grid, losses, rays)]
+    names = [module.__name__ for module in (adam, compositing, frustum, gauss_newton, grid, losses, rays)]
     for name in [*names, f"warpslam.decoder_{'cuda' if device.is_cuda else 'cpu'}"]:
         wp.get_module(name).load(device)
     return time.perf_counter() - start

@@ -7,15 +7,17 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics, pose_from_vector, vector_from_pose
 from warpslam.config import MappingConfig, SamplingConfig
-from warpslam.field import Gradients, RayBatch
+from warpslam.field import Gradients, RayBatch, Thresholds
 from warpslam.frustum import select_in_frustum
 from warpslam.keyframes import ImagePool, Keyframe, overlap_fractions
+from warpslam.launching import Launcher
 from warpslam.optimizers import ColorDecoderOptimizer, GridOptimizer, PoseOptimizer
 from warpslam.scene import LEVELS, SceneMap
 from warpslam.tracker import ray_seed
@@ -62,10 +64,12 @@ class Mapper:
     ) -> None:
         self.scene, self.camera, self.config, self.sampling = scene, camera, config, sampling
         self.device, self.seed = device, seed
-        self._grids = {level: GridOptimizer(device) for level in LEVELS}
-        self._decoder = ColorDecoderOptimizer(device)
-        self._poses = PoseOptimizer(2 * config.window + 2, device)
-        self._batch = RayBatch(config.pixels, sampling.stratified + sampling.surface, device)
+        self._launcher = Launcher(device)
+        self._grids = {level: GridOptimizer(self._launcher) for level in LEVELS}
+        self._decoder = ColorDecoderOptimizer(self._launcher)
+        self._poses = PoseOptimizer(2 * config.window + 2, self._launcher)
+        samples = sampling.stratified + sampling.surface
+        self._batch = RayBatch(config.pixels, samples, device, self._launcher)
 
     def map_first(
         self, images: ImagePool, frame: int, vector: np.ndarray, on_iteration: Callable | None = None
@@ -117,10 +121,12 @@ class Mapper:
         )
         # The oldest keyframe holds the window in place: it comes first, and its pose stays.
         window.sort(key=lambda keyframe: keyframe.index)
-        self._poses.begin(np.stack([*(keyframe.pose for keyframe in window), vector]))
+        rates = np.full((1, 2), config.bundle_adjustment_rate)
+        self._poses.begin(np.stack([*(keyframe.pose for keyframe in window), vector]), rates)
         slots = wp.array([*(keyframe.slot for keyframe in window), 0], dtype=int, device=self.device)
         self._select(images, vector, everything=refinement)
         result = MappingResult(vector, window=[keyframe.index for keyframe in window], adjusted=adjust)
+        self._launcher.forget()
 
         if config.coarse and not refinement:
             coarse_slots, coarse_poses = self._coarse_window(keyframes, vector, rng)
@@ -128,8 +134,13 @@ class Mapper:
             self._run_coarse(images, frame, coarse_slots, coarse_poses, count, rate_factor, result)
 
         stages = self._schedule(iterations, refinement)
+        self._batch.set_seeds([ray_seed(self.seed, 3, frame, n, round_) for n in range(len(stages))])
         for iteration, stage in enumerate(stages):
-            self._iterate(images, frame, slots, stage, iteration, rate_factor, adjust, refinement, round_)
+
+            def iterate(stage: str = stage) -> None:
+                self._iterate(images, slots, stage, rate_factor, adjust, refinement)
+
+            self._launcher.iterate(stage, (), iterate)
             last_of_stage = iteration + 1 == len(stages) or stages[iteration + 1] != stage
             if last_of_stage:
                 result.losses[stage] = self._mean_loss()
@@ -187,17 +198,9 @@ class Mapper:
         self._decoder.begin()
 
     def _iterate(
-        self,
-        images: ImagePool,
-        frame: int,
-        slots: wp.array,
-        stage: str,
-        iteration: int,
-        rate_factor: float,
-        adjust: bool,
-        refinement: bool,
-        round_: int,
+        self, images: ImagePool, slots: wp.array, stage: str, rate_factor: float, adjust: bool, refinement: bool
     ) -> None:
+        """One iteration of a stage; nothing in it may depend on the iteration's number, because it is replayed."""
         config, batch, arrays = self.config, self._batch, self.scene.arrays()
         color = stage == "color"
         train_decoder = color and config.train_color_decoder and not refinement
@@ -206,24 +209,17 @@ class Mapper:
             points=adjust and color,
             color_weights=self._decoder.gradient if train_decoder else None,
         )
-        seed = ray_seed(self.seed, 3, frame, iteration, round_)
+        sampling = self.sampling
         with wp.Tape() as tape:
-            batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera, seed=seed)
-            batch.cast(self._poses.poses)
+            batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera)
+            batch.cast(self._poses.poses, differentiate=gradients.points)
             batch.bound(arrays)
-            batch.place_samples(self.sampling.stratified, self.sampling.surface, jitter=self.sampling.jitter, seed=seed)
+            batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)
             scale = 1.0 / batch.count if config.loss == "mean" else 1.0
-            sampling = self.sampling
-            batch.render(
-                arrays,
-                stage,
-                gradients,
-                tape,
-                min_weight=sampling.min_weight,
-                min_gradient=sampling.min_gradient * scale,
-            )
+            thresholds = Thresholds(sampling.min_weight, sampling.min_gradient * scale, sampling.min_transmittance)
+            batch.render(arrays, stage, gradients, tape, thresholds=thresholds)
             batch.mapping_loss(config.color_weight * scale if color else 0.0, scale)
-        tape.backward(batch.loss)
+        self._launcher.call(partial(tape.backward, batch.loss))
         rates = {
             "middle": config.middle_rate if stage == "middle" else config.geometry_rate,
             "fine": config.geometry_rate,
@@ -235,7 +231,8 @@ class Mapper:
             self._decoder.update_decoder(self.scene.decoders["color"], config.color_rate * rate_factor)
         if adjust and color:
             # Moments start in the colour stage: the earlier stages never ask for pose gradients.
-            self._poses.update(config.bundle_adjustment_rate, config.bundle_adjustment_rate, first=1)
+            self._poses.update(first=1)
+        batch.next_iteration()
 
     # -- the coarse level (Sec. 3.1; in the released code it serves forecasts only) -------------------------------
 
@@ -262,22 +259,25 @@ class Mapper:
         result: MappingResult,
     ) -> None:
         """Coarse stage: no depth guidance, depth loss only, all vertices."""
-        config, batch, arrays = self.config, self._batch, self.scene.arrays()
+        config, batch, arrays, sampling = self.config, self._batch, self.scene.arrays(), self.sampling
         optimizer = self._grids["coarse"]
         gradients = Gradients(grids={"coarse": optimizer.wanted()})
-        for iteration in range(iterations):
-            seed = ray_seed(self.seed, 4, frame, iteration)
+
+        def iterate() -> None:
             with wp.Tape() as tape:
-                batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera, seed=seed)
+                batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera)
                 batch.cast(poses)
                 batch.bound(arrays, use_depth=False)
-                batch.place_samples(
-                    self.sampling.stratified, 0, use_depth=False, jitter=self.sampling.jitter, seed=seed
-                )
+                batch.place_samples(sampling.stratified, 0, use_depth=False, jitter=sampling.jitter)
                 batch.render(arrays, "coarse", gradients, tape)
                 batch.mapping_loss(0.0, 1.0 / batch.count if config.loss == "mean" else 1.0)
-            tape.backward(batch.loss)
+            self._launcher.call(partial(tape.backward, batch.loss))
             optimizer.update(self.scene.grids["coarse"].features, config.coarse_rate * rate_factor)
+            batch.next_iteration()
+
+        batch.set_seeds([ray_seed(self.seed, 4, frame, n) for n in range(iterations)])
+        for _ in range(iterations):
+            self._launcher.iterate("coarse", (), iterate)
         result.losses["coarse"] = self._mean_loss()
 
     def _mean_loss(self) -> float:

@@ -8,18 +8,18 @@ import warp as wp
 from warpslam.field import GridGradient, PackedDecoder, gradient_buffers
 from warpslam.kernels import adam, decoder
 from warpslam.kernels.grid import Vec32
-from warpslam.launching import decoders_for, launch_points
+from warpslam.launching import Launcher, Step, decoders_for
 from warpslam.scene import FeatureGrid
 
 
 class RowOptimizer:
     """Adam on some rows of an array of `Vec32`. Buffers persist between calls and grow with the array."""
 
-    def __init__(self, device: wp.Device) -> None:
-        self.device = device
+    def __init__(self, launcher: Launcher) -> None:
+        self.launcher, self.device = launcher, launcher.device
         self.size = 0
-        self.step = wp.zeros(1, dtype=int, device=device)
-        self._rejected = wp.zeros(1, dtype=int, device=device)
+        self.step = wp.zeros(1, dtype=int, device=self.device)
+        self._rejected = wp.zeros(1, dtype=int, device=self.device)
 
     def start(self, size: int, rows: np.ndarray) -> None:
         """Begin a call: ``rows`` (int) of ``size`` change, with moments and step count at zero."""
@@ -32,24 +32,25 @@ class RowOptimizer:
         self.step.zero_()
         self._rejected.zero_()
         if len(rows):
-            self._launch(adam.clear_moments, len(rows), [self.rows, self.m, self.v])
+            self.launcher.launch(adam.clear_moments, len(rows), [self.rows, self.m, self.v])
 
     def update(self, x: wp.array, learning_rate: float) -> None:
         """One step on ``x`` from the gradient buffers, which are zero afterwards."""
         count = self.rows.shape[0]
         if count == 0:
             return
-        self._launch(adam.advance_step, 1, [self.step])
+        self.launcher.launch(adam.advance_step, 1, [self.step])
         inputs = [self.rows, self.step, learning_rate, x, self.gradient, self.m, self.v, self._rejected]
-        launch_points(adam.adam_rows, count, inputs, self.device)
+
+        def steps(first: int, stop: int, slot: int) -> list[Step]:
+            return [(adam.adam_rows, stop - first, [first, *inputs])]
+
+        self.launcher.slices(count, steps)
 
     @property
     def has_rejected(self) -> bool:
         """Whether a gradient of this call was not finite; such rows were left as they were."""
         return bool(self._rejected.numpy()[0])
-
-    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_tape=False)
 
 
 class GridOptimizer(RowOptimizer):
@@ -77,39 +78,45 @@ class ColorDecoderOptimizer(RowOptimizer):
         self.update(packed.weights, learning_rate)
         transposed = packed.transposed
         kernel = decoders_for(self.device).transpose_color_weights
-        self._launch(kernel, transposed.shape[0], [packed.weights, transposed])
+        self.launcher.launch(kernel, transposed.shape[0], [packed.weights, transposed])
 
 
 class PoseOptimizer:
     """Adam on pose vectors (qw, qx, qy, qz, tx, ty, tz); the quaternion is not renormalised meanwhile."""
 
-    def __init__(self, capacity: int, device: wp.Device) -> None:
-        self.device = device
-        self.step = wp.zeros(1, dtype=int, device=device)
-        self._all = wp.zeros((capacity, 7), dtype=float, device=device, requires_grad=True)
-        self._m = wp.zeros((capacity, 7), dtype=float, device=device)
-        self._v = wp.zeros((capacity, 7), dtype=float, device=device)
+    def __init__(self, capacity: int, launcher: Launcher) -> None:
+        self.launcher, self.device = launcher, launcher.device
+        self.step = wp.zeros(1, dtype=int, device=self.device)
+        self._all = wp.zeros((capacity, 7), dtype=float, device=self.device, requires_grad=True)
+        self._m = wp.zeros((capacity, 7), dtype=float, device=self.device)
+        self._v = wp.zeros((capacity, 7), dtype=float, device=self.device)
+        self.rates = wp.zeros(1, dtype=wp.vec2, device=self.device)
+        self.count = 1
+        self.poses = self._all[:1]
 
-    def begin(self, vectors: np.ndarray) -> None:
-        """Start from ``vectors``, float (frames, 7)."""
-        self.count = len(vectors)
-        self.poses = self._all[: self.count]
+    def begin(self, vectors: np.ndarray, rates: np.ndarray | None = None) -> None:
+        """Start from ``vectors``, float (frames, 7).
+
+        rates: Learning rates of rotation and translation, one row a step, float (steps, 2); the last one holds on.
+        """
+        if len(vectors) != self.count:
+            self.count = len(vectors)
+            self.poses = self._all[: self.count]
         self.poses.assign(np.asarray(vectors, np.float32))
+        if rates is not None:
+            if len(rates) != self.rates.shape[0]:
+                self.rates = wp.zeros(len(rates), dtype=wp.vec2, device=self.device)
+            self.rates.assign(np.asarray(rates, np.float32))
         self._all.grad.zero_()
         self._m.zero_()
         self._v.zero_()
         self.step.zero_()
 
-    def update(self, rotation_rate: float, translation_rate: float, first: int = 0) -> None:
+    def update(self, first: int = 0) -> None:
         """One step on the poses from row ``first`` on, from ``poses.grad``, which is zero afterwards."""
-        wp.launch(adam.advance_step, dim=1, inputs=[self.step], device=self.device, record_tape=False)
-        wp.launch(
-            adam.adam_poses,
-            dim=(self.count, 7),
-            inputs=[self.step, rotation_rate, translation_rate, first] + [self._all, self._all.grad, self._m, self._v],
-            device=self.device,
-            record_tape=False,
-        )
+        self.launcher.launch(adam.advance_step, 1, [self.step])
+        inputs = [self.step, self.rates, first, self._all, self._all.grad, self._m, self._v]
+        self.launcher.launch(adam.adam_poses, (self.count, 7), inputs)
 
     def vectors(self) -> np.ndarray:
         """Poses as they are now, float64 (frames, 7)."""

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics, pose_from_vector, vector_from_pose
 from warpslam.config import SamplingConfig, TrackingConfig
-from warpslam.field import FieldArrays, Gradients, RayBatch
+from warpslam.field import FieldArrays, Gradients, RayBatch, Thresholds
+from warpslam.kernels import adam
 from warpslam.keyframes import ImagePool
+from warpslam.launching import Launcher
 from warpslam.optimizers import PoseOptimizer
-
-# Gauss-Newton: residuals below the floors count as squares; damping; largest step.
-DEPTH_FLOOR = 0.005
-SIGMA_FLOOR = 0.005
-GREY_FLOOR = 0.02
-DAMPING = 1e-3
-MAX_TRANSLATION = 0.05
-MAX_ROTATION = 0.05
 
 
 @dataclass(frozen=True)
@@ -45,11 +40,12 @@ class Tracker:
         self, camera: Intrinsics, config: TrackingConfig, sampling: SamplingConfig, device: wp.Device, seed: int
     ) -> None:
         self.camera, self.config, self.sampling, self.device, self.seed = camera, config, sampling, device, seed
+        self._launcher = Launcher(device)
         self._batch = self._new_batch(config.pixels)
-        self._poses = PoseOptimizer(1, device)
+        self._poses = PoseOptimizer(1, self._launcher)
         self._window = wp.zeros(1, dtype=int, device=device)
-        self._gradients = Gradients(points=True)
-        self._thresholds = {"min_weight": sampling.min_weight, "min_gradient": sampling.min_gradient}
+        self._visited = wp.zeros((1, 7), dtype=float, device=device)
+        self._thresholds = Thresholds(sampling.min_weight, sampling.min_gradient, sampling.min_transmittance)
 
     def track(
         self, arrays: FieldArrays, images: ImagePool, frame: int, initial: np.ndarray, *, effort: int = 1
@@ -60,8 +56,7 @@ class Tracker:
         config = self.config
         batch = self._batch if effort == 1 else self._new_batch(config.pixels * effort)
         start = vector_from_pose(initial)
-        method = self._descend if config.optimizer == "adam" else self._gauss_newton
-        visited = method(batch, arrays, images, frame, start, config.iterations * effort)
+        visited = self._optimize(batch, arrays, images, frame, start, config.iterations * effort)
         candidates = [visited[-1]]
         if config.keep_best == "fixed_pixels":
             # Different pixels give different losses; only a comparison on the same ones means something.
@@ -70,59 +65,43 @@ class Tracker:
         results = [self._judge(batch, arrays, images, frame, vector) for vector in candidates]
         return min(results, key=lambda result: result.loss)
 
-    def _descend(
+    def _optimize(
         self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, frame: int, start: np.ndarray, iterations: int
     ) -> np.ndarray:
-        """The paper's optimiser: Adam on the pose vector, new pixels every iteration. Returns the poses visited, (n,
-        7).
-        """
+        """New pixels every iteration; nothing comes back from the device before the last. The poses visited, (n, 7)."""
         config = self.config
-        self._poses.begin(start[None])
-        visited = np.empty((iterations, 7))
-        for iteration in range(iterations):
-            with wp.Tape() as tape:
-                self._evaluate(batch, arrays, images, self._ray_seed(frame, iteration), tape)
-                batch.tracking_loss(config.color_weight)
-            tape.backward(batch.loss)
-            progress = iteration / max(iterations - 1, 1)
-            rate = config.learning_rate * config.final_rate_factor**progress
-            self._poses.update(rate * config.rotation_rate_factor, rate)
-            visited[iteration] = self._poses.vectors()[0]
-        return visited
+        progress = np.linspace(0.0, 1.0, iterations)[:, None]
+        rates = config.learning_rate * config.final_rate_factor**progress * [config.rotation_rate_factor, 1.0]
+        self._poses.begin(start[None], rates)
+        batch.set_seeds([self._ray_seed(frame, iteration) for iteration in range(iterations)])
+        if self._visited.shape[0] != iterations:
+            self._visited = wp.zeros((iterations, 7), dtype=float, device=self.device)
+        method = self._descend if config.optimizer == "adam" else self._gauss_newton
 
-    def _gauss_newton(
-        self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, frame: int, start: np.ndarray, iterations: int
-    ) -> np.ndarray:
-        """Gauss-Newton on the same loss: its absolute values are reweighted as squares, |r| ~ r^2 / max(|r0|, floor).
+        def iterate() -> None:
+            method(batch, arrays, images)
+            self._launcher.launch(adam.note_pose, 7, [batch.iteration, self._poses.poses, self._visited])
+            batch.next_iteration()
 
-        Colour enters as the mean of its channels. New pixels every iteration. Returns the poses visited, (n, 7).
+        uses = (config.optimizer, config.color_weight, self._poses.rates, self._visited, *self._uses(batch, arrays))
+        for _ in range(iterations):
+            self._launcher.iterate("optimize", (*uses, *images.arrays), iterate)
+        return self._visited.numpy().astype(np.float64)
+
+    def _descend(self, batch: RayBatch, arrays: FieldArrays, images: ImagePool) -> None:
+        """The paper's optimiser: a step of Adam on the pose vector."""
+        with wp.Tape() as tape:
+            self._render(batch, arrays, images, tape)
+            batch.tracking_loss(self.config.color_weight)
+        self._launcher.call(partial(tape.backward, batch.loss))
+        self._poses.update()
+
+    def _gauss_newton(self, batch: RayBatch, arrays: FieldArrays, images: ImagePool) -> None:
+        """A Gauss-Newton step on the same loss: its absolute values are reweighted as squares, and colour enters as the
+        mean of its channels.
         """
-        config = self.config
-        vector = start
-        visited = np.empty((iterations, 7))
-        for iteration in range(iterations):
-            self._poses.begin(vector[None])
-            self._evaluate(batch, arrays, images, self._ray_seed(frame, iteration))
-            by_depth, by_grey = batch.pose_jacobians(arrays, **self._thresholds)
-            inlier = batch.inlier.numpy()[: batch.count] != 0
-            sigma = batch.sigma.numpy()[: batch.count][inlier]
-            depth_error = (batch.measured_depth.numpy() - batch.depth.numpy())[: batch.count][inlier]
-            grey_error = (batch.measured_rgb.numpy() - batch.rgb.numpy())[: batch.count][inlier].mean(axis=1)
-            weights = 1.0 / (np.maximum(sigma, SIGMA_FLOOR) * np.maximum(np.abs(depth_error), DEPTH_FLOOR))
-            grey_weights = 3.0 * config.color_weight / np.maximum(np.abs(grey_error), GREY_FLOOR)
-            J = np.concatenate([by_depth[inlier], by_grey[inlier]]).astype(np.float64)
-            w = np.concatenate([weights, grey_weights]).astype(np.float64)
-            r = np.concatenate([depth_error, grey_error]).astype(np.float64)
-            usable = np.isfinite(J).all(axis=1) & np.isfinite(r) & np.isfinite(w)
-            J, w, r = J[usable], w[usable], r[usable]
-            H = (J * w[:, None]).T @ J
-            step = np.linalg.solve(H + np.diag(DAMPING * np.diag(H) + 1e-9), (J * w[:, None]).T @ r)
-            # A single step never leaves the basin that the samples around the surface can see.
-            step *= min(1.0, MAX_TRANSLATION / max(np.linalg.norm(step[:3]), 1e-12))
-            step *= min(1.0, MAX_ROTATION / max(np.linalg.norm(step[3:]), 1e-12))
-            vector = vector_from_pose(_moved(pose_from_vector(vector), step))
-            visited[iteration] = vector
-        return visited
+        self._render(batch, arrays, images)
+        batch.gauss_newton_step(arrays, self._poses.poses, self.config.color_weight, thresholds=self._thresholds)
 
     def explained_share(self, known_error: float) -> float:
         """Share of the last judged pixels whose rendered depth is within ``known_error`` x D (information gain, Sec.
@@ -141,8 +120,14 @@ class Tracker:
         self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, frame: int, vector: np.ndarray
     ) -> TrackingResult:
         self._poses.begin(vector[None])
-        self._evaluate(batch, arrays, images, self._ray_seed(frame, -1))
-        batch.tracking_loss(self.config.color_weight)
+        batch.set_seeds([self._ray_seed(frame, -1)])
+
+        def judge() -> None:
+            self._render(batch, arrays, images)
+            batch.tracking_loss(self.config.color_weight)
+
+        uses = (self.config.color_weight, *self._uses(batch, arrays), *images.arrays)
+        self._launcher.iterate("judge", uses, judge)
         count = batch.count
         inlier = batch.inlier.numpy()[:count] != 0
         measured = batch.measured_depth.numpy()[:count]
@@ -156,46 +141,31 @@ class Tracker:
             inliers=inlier_count / max(int((measured > 0).sum()), 1),
         )
 
-    def _evaluate(
-        self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, seed: int, tape: wp.Tape | None = None
+    def _render(
+        self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, tape: wp.Tape | None = None
     ) -> None:
-        config = self.config
-        rays = batch.capacity
-        batch.draw(
-            images.arrays,
-            self._window,
-            rays,
-            self.camera,
-            seed=seed,
-            edge_u=config.ignore_edge_u,
-            edge_v=config.ignore_edge_v,
-        )
-        batch.cast(self._poses.poses)
+        config, sampling = self.config, self.sampling
+        edges = {"edge_u": config.ignore_edge_u, "edge_v": config.ignore_edge_v}
+        batch.draw(images.arrays, self._window, batch.capacity, self.camera, **edges)
+        batch.cast(self._poses.poses, differentiate=tape is not None)
         batch.bound(arrays)
-        batch.place_samples(self.sampling.stratified, self.sampling.surface, jitter=self.sampling.jitter, seed=seed)
-        gradients = None if tape is None else self._gradients
-        batch.render(arrays, "color", gradients, tape, **self._thresholds)
+        batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)
+        gradients = None if tape is None else Gradients(points=True)
+        batch.render(arrays, "color", gradients, tape, thresholds=self._thresholds)
         batch.choose_inliers(config.dynamic_filter, median_includes_missing=config.median_includes_missing)
+
+    def _uses(self, batch: RayBatch, arrays: FieldArrays) -> tuple:
+        """What a recorded iteration stands on."""
+        features = (arrays.features[level] for level in ("middle", "fine", "color"))
+        weights = (arrays.decoders[level].weights for level in ("middle", "fine", "color"))
+        return (batch, batch.seeds, self._poses.poses, *features, *weights, *arrays.low, *arrays.high)
 
     def _ray_seed(self, frame: int, iteration: int) -> int:
         return ray_seed(self.seed, 1, frame, iteration)
 
     def _new_batch(self, pixels: int) -> RayBatch:
-        return RayBatch(pixels, self.sampling.stratified + self.sampling.surface, self.device)
-
-
-def _moved(T_world_camera: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Camera moved by a world translation and turned about its centre by a world rotation vector (step: both, (6,))."""
-    angle = np.linalg.norm(step[3:])
-    K = np.zeros((3, 3))
-    if angle > 0:
-        x, y, z = step[3:] / angle
-        K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    R = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
-    T = T_world_camera.copy()
-    T[:3, :3] = R @ T[:3, :3]
-    T[:3, 3] += step[:3]
-    return T
+        samples = self.sampling.stratified + self.sampling.surface
+        return RayBatch(pixels, samples, self.device, self._launcher)
 
 
 def ray_seed(*key: int) -> int:

@@ -99,7 +99,8 @@ def test_pose_after_one_adam_step(scene, iteration, device):
     first, second = (wp.zeros((1, 7), dtype=float, device=device) for _ in range(2))
     rate = scene.tracking.learning_rate
     wp.launch(adam.advance_step, dim=1, inputs=[step], device=device)
-    inputs = [step, rate, rate, 0, run.poses, run.poses.grad, first, second]
+    rates = wp.array([[rate, rate]], dtype=wp.vec2, device=device)
+    inputs = [step, rates, 0, run.poses, run.poses.grad, first, second]
     wp.launch(adam.adam_poses, dim=(1, 7), inputs=inputs, device=device)
     np.testing.assert_allclose(run.poses.numpy()[0], scene.tracking.pose_after_adam, atol=5e-7)
     assert not run.poses.grad.numpy().any()

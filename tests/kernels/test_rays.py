@@ -7,7 +7,7 @@ import warp as wp
 from warpslam.camera import Intrinsics, vector_from_pose
 from warpslam.config import GridConfig
 from warpslam.decoders import load_decoders
-from warpslam.field import Gradients, GridGradient, RayBatch, gradient_buffers
+from warpslam.field import Gradients, GridGradient, RayBatch, Thresholds, gradient_buffers
 from warpslam.keyframes import ImagePool
 from warpslam.scene import SceneMap
 
@@ -45,10 +45,11 @@ def draw(images, device, scene_map, *, jitter: bool, seed: int = 5) -> RayBatch:
     batch = RayBatch(RAYS, 48, device)
     window = wp.array([0, 1], dtype=int, device=device)
     poses = wp.array(np.stack([vector_from_pose(np.eye(4))] * 2), dtype=float, device=device, requires_grad=True)
-    batch.draw(images[0].arrays, window, RAYS // 2, CAMERA, seed=seed, edge_u=3, edge_v=2)
+    batch.set_seeds([seed])
+    batch.draw(images[0].arrays, window, RAYS // 2, CAMERA, edge_u=3, edge_v=2)
     batch.cast(poses)
     batch.bound(scene_map.arrays())
-    batch.place_samples(32, 16, jitter=jitter, seed=seed)
+    batch.place_samples(32, 16, jitter=jitter)
     return batch
 
 
@@ -91,7 +92,7 @@ def test_jittered_samples_stay_in_their_strata(images, device, scene_map):
     assert np.abs(z - z_even).mean() > 0.005
 
 
-def render(batch: RayBatch, scene_map: SceneMap, min_weight: float, min_gradient: float):
+def render(batch: RayBatch, scene_map: SceneMap, *thresholds: float):
     """Colour, depth, ray gradient and colour-grid gradient of a mapping loss with some thresholds."""
     arrays = scene_map.arrays()
     rows = scene_map.grids["color"].row_count
@@ -100,7 +101,7 @@ def render(batch: RayBatch, scene_map: SceneMap, min_weight: float, min_gradient
         array.zero_()
     with wp.Tape() as tape:
         gradients = Gradients({"color": grid}, points=True)
-        batch.render(arrays, "color", gradients, tape, min_weight=min_weight, min_gradient=min_gradient)
+        batch.render(arrays, "color", gradients, tape, thresholds=Thresholds(*thresholds))
         batch.mapping_loss(0.2)
     tape.backward(batch.loss)
     parts = batch.rgb, batch.depth, batch.direction.grad
@@ -122,6 +123,27 @@ def test_skipped_samples_keep_the_stated_bounds(images, device, scene_map):
     np.testing.assert_array_equal(depth, exact[1])
     for skipped, full in ((direction, exact[2]), (rows, exact[3])):
         assert np.linalg.norm(skipped - full) < 0.02 * np.linalg.norm(full)
+
+
+def test_rays_that_end_early_keep_the_stated_bounds(images, device, scene_map):
+    """Depth and colour err by less than what is left of the light allows; gradients hardly change; work is saved."""
+    batch = draw(images, device, scene_map, jitter=True)
+    exact = render(batch, scene_map, 0.0, 0.0)
+    kept = batch.keep.numpy() != 0
+    all_weights = batch.weight.numpy().reshape(RAYS, 48)[kept]
+    color = batch.color.numpy().reshape(RAYS, 48, 3)[kept]
+    least = 0.05
+    rgb, depth, direction, rows = render(batch, scene_map, 0.0, 0.0, least)
+    weights = batch.weight.numpy().reshape(RAYS, 48)[kept]
+    left_out = (weights == 0) & (all_weights > 0)
+    assert left_out.sum() > 0.02 * left_out.size, "no ray ended: the test looks at nothing"
+    np.testing.assert_array_equal(weights[~left_out], all_weights[~left_out])
+    assert (all_weights * left_out).sum(axis=1).max() < least
+    farthest = batch.z.numpy().reshape(RAYS, 48)[kept].max(axis=1)
+    assert (np.abs(depth - exact[1])[kept] <= least * farthest).all()
+    assert (np.abs(rgb - exact[0])[kept] <= least * np.abs(color).max()).all()
+    for short, full in ((direction, exact[2]), (rows, exact[3])):
+        assert np.linalg.norm(short - full) < 0.05 * np.linalg.norm(full)
 
 
 def test_gradients_without_a_tape_are_refused(images, device, scene_map):

@@ -71,15 +71,17 @@ def clear_moments(rows: wp.array(dtype=int), m: wp.array(dtype=Vec32), v: wp.arr
 @wp.kernel(enable_backward=False)
 def adam_poses(
     step: wp.array(dtype=int),
-    rotation_rate: float,
-    translation_rate: float,
+    rates: wp.array(dtype=wp.vec2),
     first: int,
     x: wp.array(dtype=float, ndim=2),
     grad: wp.array(dtype=float, ndim=2),
     m: wp.array(dtype=float, ndim=2),
     v: wp.array(dtype=float, ndim=2),
 ):
-    """Pose vectors (qw, qx, qy, qz, tx, ty, tz); rows below ``first`` stay fixed. Clears the gradient."""
+    """Pose vectors (qw, qx, qy, qz, tx, ty, tz); rows below ``first`` stay fixed. Clears the gradient.
+
+    rates: of rotation and translation, one row a step; the last row holds from there on.
+    """
     f, k = wp.tid()
     g = grad[f, k]
     grad[f, k] = 0.0
@@ -88,5 +90,15 @@ def adam_poses(
     scale = adam_scale(step[0])
     m[f, k] = 0.9 * m[f, k] + 0.1 * g
     v[f, k] = 0.999 * v[f, k] + 0.001 * g * g
-    rate = wp.where(k < 4, rotation_rate, translation_rate)
+    both = rates[wp.min(step[0], rates.shape[0]) - 1]
+    rate = wp.where(k < 4, both[0], both[1])
     x[f, k] = x[f, k] - rate * scale[0] * m[f, k] / (wp.sqrt(scale[1] * v[f, k]) + 1.0e-8)
+
+
+@wp.kernel(enable_backward=False)
+def note_pose(
+    iteration: wp.array(dtype=int), poses: wp.array(dtype=float, ndim=2), visited: wp.array(dtype=float, ndim=2)
+):
+    """Keep the first pose vector of an iteration."""
+    k = wp.tid()
+    visited[iteration[0], k] = poses[0, k]

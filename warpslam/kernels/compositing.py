@@ -10,7 +10,9 @@ Adjoint, for incoming d_depth and d_rgb (the losses detach the variance), with g
     d_c_i     = w_i d_rgb
 
 Samples with w_i < ``min_weight`` need no colour: it is taken as black, so that rgb errs by less than sample_count *
-min_weight.
+min_weight. Where T_i < ``min_transmittance`` at the start of a group of samples, these and all behind are left out:
+they count as outside with w = 0. What is left out weighs less than min_transmittance in all, so that depth errs by less
+than min_transmittance * z_max, and rgb by less than min_transmittance * the brightest colour.
 Per-sample arrays have shape (ray_count * sample_count,). Rays that are not kept render 0 and have no gradient.
 """
 
@@ -30,55 +32,100 @@ def occupancy(logit: float) -> float:
 
 
 @wp.kernel(enable_backward=False)
+def start_rays(
+    start: int,
+    keep: wp.array(dtype=int),
+    transmittance: wp.array(dtype=float),
+    depth: wp.array(dtype=float),
+    variance: wp.array(dtype=float),
+    rgb: wp.array(dtype=wp.vec3),
+):
+    """Nothing absorbed yet; a transmittance of -1 marks rays that are not kept."""
+    tid = start + wp.tid()
+    transmittance[tid] = wp.where(keep[tid] != 0, 1.0, -1.0)
+    depth[tid] = 0.0
+    variance[tid] = 0.0
+    rgb[tid] = wp.vec3()
+
+
+@wp.kernel(enable_backward=False)
 def composite(
+    start: int,
+    first_sample: int,
+    width: int,
     sample_count: int,
+    min_transmittance: float,
     low: wp.vec3,
     high: wp.vec3,
     ray_origin: wp.array(dtype=wp.vec3),
     ray_direction: wp.array(dtype=wp.vec3),
     z: wp.array(dtype=float),
-    keep: wp.array(dtype=int),
     logit: wp.array(dtype=float),
+    weight: wp.array(dtype=float),
+    transmittance: wp.array(dtype=float),
+    depth: wp.array(dtype=float),
+):
+    """Weights of the next samples of each ray, whose transmittance and depth so far are carried along."""
+    tid = start + wp.tid()
+    passed = transmittance[tid]
+    if passed < 0.0:
+        return
+    first = tid * sample_count + first_sample
+    if passed < min_transmittance:
+        for n in range(width):
+            logit[first + n] = OUTSIDE_LOGIT
+            weight[first + n] = 0.0
+        return
+    d = depth[tid]
+    for n in range(width):
+        i = first + n
+        if not is_inside(ray_origin[tid] + z[i] * ray_direction[tid], low, high):
+            logit[i] = OUTSIDE_LOGIT
+        alpha = occupancy(logit[i])
+        w = alpha * passed
+        passed *= 1.0 - alpha + 1.0e-10
+        weight[i] = w
+        d += w * z[i]
+    transmittance[tid] = passed
+    depth[tid] = d
+
+
+@wp.kernel(enable_backward=False)
+def ray_variance(
+    start: int,
+    sample_count: int,
+    z: wp.array(dtype=float),
+    keep: wp.array(dtype=int),
     weight: wp.array(dtype=float),
     depth: wp.array(dtype=float),
     variance: wp.array(dtype=float),
 ):
-    tid = wp.tid()
-    d = float(0.0)
+    tid = start + wp.tid()
+    if keep[tid] == 0:
+        return
     v = float(0.0)
-    if keep[tid] != 0:
-        first = tid * sample_count
-        transmittance = float(1.0)
-        for n in range(sample_count):
-            i = first + n
-            if not is_inside(ray_origin[tid] + z[i] * ray_direction[tid], low, high):
-                logit[i] = OUTSIDE_LOGIT
-            alpha = occupancy(logit[i])
-            w = alpha * transmittance
-            transmittance *= 1.0 - alpha + 1.0e-10
-            weight[i] = w
-            d += w * z[i]
-        for n in range(sample_count):
-            e = z[first + n] - d
-            v += weight[first + n] * e * e
-    depth[tid] = d
+    for n in range(sample_count):
+        e = z[tid * sample_count + n] - depth[tid]
+        v += weight[tid * sample_count + n] * e * e
     variance[tid] = v
 
 
 @wp.kernel(enable_backward=False)
 def composite_color(
+    start: int,
     sample_count: int,
     keep: wp.array(dtype=int),
     color: wp.array(dtype=wp.vec3),
     weight: wp.array(dtype=float),
     rgb: wp.array(dtype=wp.vec3),
 ):
-    tid = wp.tid()
+    tid = start + wp.tid()
+    if keep[tid] == 0:
+        return
     c = wp.vec3()
-    if keep[tid] != 0:
-        for n in range(sample_count):
-            i = tid * sample_count + n
-            c += weight[i] * color[i]
+    for n in range(sample_count):
+        i = tid * sample_count + n
+        c += weight[i] * color[i]
     rgb[tid] = c
 
 
@@ -116,6 +163,7 @@ def surface_depth(
 
 @wp.kernel(enable_backward=False)
 def composite_backward(
+    start: int,
     sample_count: int,
     z: wp.array(dtype=float),
     keep: wp.array(dtype=int),
@@ -129,7 +177,7 @@ def composite_backward(
     logit_grad: wp.array(dtype=float),
     color_grad: wp.array(dtype=wp.vec3),
 ):
-    tid = wp.tid()
+    tid = start + wp.tid()
     first = tid * sample_count
     kept = keep[tid] != 0
     d_depth = depth_grad[tid]

@@ -7,13 +7,11 @@ Middle, fine and colour, with e = sin(p B) in R^93 and the looked-up feature c (
 
 Coarse has no embedding and no V_k:  h = c;  h = relu(W_k h + b_k);  after k = 2: h = [c, h].
 
-One thread a point. A weight matrix is stored as rows of `Vec32`, row k holding what input k adds to the 32 outputs, so
-that a
-layer is ``r += x[k] * W[k]`` and vectorises over the outputs; the adjoint uses the same rows of the transposed
-matrices. The forward
-keeps one bit per ReLU (5 words a point and decoder); the adjoint kernels are written by hand, because the generated
-adjoint
-replays the forward and costs 4 to 16 times as much. They return
+One thread a point; a forward launch covers some samples of each ray, and skips rays whose transmittance is spent. A
+weight matrix is stored as rows of `Vec32`, row k holding what input k adds to the 32 outputs, so that a layer is
+``r += x[k] * W[k]`` and vectorises over the outputs; the adjoint uses the same rows of the transposed matrices. The
+forward keeps one bit per ReLU (5 words a point and decoder); the adjoint kernels are written by hand, because the
+generated adjoint replays the forward and costs 4 to 16 times as much. They return
 
     d_logit -> rows of the grid that are selected (``grid_grad``), the sample position (``point_grad``), and for the
     colour decoder
@@ -155,6 +153,12 @@ def keep_bits(a: Vec32, bits: wp.uint32) -> Vec32:
 
 
 @wp.func
+def sample_index(thread: int, first_ray: int, first_sample: int, width: int, sample_count: int) -> int:
+    """Sample of a thread, where a launch covers samples ``first_sample`` to ``first_sample + width`` of some rays."""
+    return (first_ray + thread // width) * sample_count + first_sample + thread % width
+
+
+@wp.func
 def sample_point(
     tid: int,
     sample_count: int,
@@ -210,21 +214,24 @@ def decoder_kernels(target: str) -> SimpleNamespace:
 
     @kernel
     def middle_forward(
-        start: int,
+        first_ray: int,
+        first_sample: int,
+        width: int,
         trips: int,
         sample_count: int,
         ray_origin: wp.array(dtype=wp.vec3),
         ray_direction: wp.array(dtype=wp.vec3),
         z: wp.array(dtype=float),
-        keep: wp.array(dtype=int),
+        transmittance: wp.array(dtype=float),
+        min_transmittance: float,
         lattice: Lattice,
         features: wp.array(dtype=Vec32),
         W: wp.array(dtype=Vec32),
         bits: wp.array2d(dtype=wp.uint32),
         logit: wp.array(dtype=float),
     ):
-        tid = start + wp.tid()
-        if keep[tid // sample_count] == 0:
+        tid = sample_index(wp.tid(), first_ray, first_sample, width, sample_count)
+        if transmittance[tid // sample_count] < min_transmittance:
             return
         p = sample_point(tid, sample_count, ray_origin, ray_direction, z)
         c = interpolate(features, lattice, find_cell(lattice, p))
@@ -252,13 +259,16 @@ def decoder_kernels(target: str) -> SimpleNamespace:
 
     @kernel
     def fine_forward(
-        start: int,
+        first_ray: int,
+        first_sample: int,
+        width: int,
         trips: int,
         sample_count: int,
         ray_origin: wp.array(dtype=wp.vec3),
         ray_direction: wp.array(dtype=wp.vec3),
         z: wp.array(dtype=float),
-        keep: wp.array(dtype=int),
+        transmittance: wp.array(dtype=float),
+        min_transmittance: float,
         lattice: Lattice,
         features: wp.array(dtype=Vec32),
         middle_lattice: Lattice,
@@ -267,8 +277,8 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         bits: wp.array2d(dtype=wp.uint32),
         logit: wp.array(dtype=float),
     ):
-        tid = start + wp.tid()
-        if keep[tid // sample_count] == 0:
+        tid = sample_index(wp.tid(), first_ray, first_sample, width, sample_count)
+        if transmittance[tid // sample_count] < min_transmittance:
             return
         p = sample_point(tid, sample_count, ray_origin, ray_direction, z)
         c = interpolate(features, lattice, find_cell(lattice, p))
@@ -357,13 +367,16 @@ def decoder_kernels(target: str) -> SimpleNamespace:
 
     @kernel
     def color_forward(
-        start: int,
+        first_ray: int,
+        first_sample: int,
+        width: int,
         trips: int,
         sample_count: int,
         ray_origin: wp.array(dtype=wp.vec3),
         ray_direction: wp.array(dtype=wp.vec3),
         z: wp.array(dtype=float),
-        keep: wp.array(dtype=int),
+        transmittance: wp.array(dtype=float),
+        min_transmittance: float,
         lattice: Lattice,
         features: wp.array(dtype=Vec32),
         W: wp.array(dtype=Vec32),
@@ -374,8 +387,8 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         min_weight: float,
         color: wp.array(dtype=wp.vec3),
     ):
-        tid = start + wp.tid()
-        if keep[tid // sample_count] == 0:
+        tid = sample_index(wp.tid(), first_ray, first_sample, width, sample_count)
+        if transmittance[tid // sample_count] < min_transmittance:
             return
         if weight[tid] < min_weight:
             color[tid] = wp.vec3()
@@ -533,21 +546,24 @@ def decoder_kernels(target: str) -> SimpleNamespace:
 
     @kernel
     def coarse_forward(
-        start: int,
+        first_ray: int,
+        first_sample: int,
+        width: int,
         trips: int,
         sample_count: int,
         ray_origin: wp.array(dtype=wp.vec3),
         ray_direction: wp.array(dtype=wp.vec3),
         z: wp.array(dtype=float),
-        keep: wp.array(dtype=int),
+        transmittance: wp.array(dtype=float),
+        min_transmittance: float,
         lattice: Lattice,
         features: wp.array(dtype=Vec32),
         W: wp.array(dtype=Vec32),
         bits: wp.array2d(dtype=wp.uint32),
         logit: wp.array(dtype=float),
     ):
-        tid = start + wp.tid()
-        if keep[tid // sample_count] == 0:
+        tid = sample_index(wp.tid(), first_ray, first_sample, width, sample_count)
+        if transmittance[tid // sample_count] < min_transmittance:
             return
         p = sample_point(tid, sample_count, ray_origin, ray_direction, z)
         c = interpolate(features, lattice, find_cell(lattice, p))

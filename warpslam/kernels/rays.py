@@ -33,7 +33,8 @@ def rotation_from_quaternion(w: float, x: float, y: float, z: float) -> wp.mat33
 
 @wp.kernel(enable_backward=False)
 def draw_pixels(
-    seed: int,
+    seeds: wp.array(dtype=int),
+    iteration: wp.array(dtype=int),
     rays_per_frame: int,
     window: wp.array(dtype=int),
     edge_u: int,
@@ -48,13 +49,16 @@ def draw_pixels(
     depth: wp.array(dtype=float),
     rgb: wp.array(dtype=wp.vec3),
 ):
-    """Uniform pixels, with replacement, inside the border; ``window[f]`` is the image slot of frame f of the window."""
+    """Uniform pixels, with replacement, inside the border; ``window[f]`` is the image slot of frame f of the window.
+
+    Seeds lie on the device, one an iteration, so that a recorded iteration draws other pixels when it is replayed.
+    """
     tid = wp.tid()
     f = tid // rays_per_frame
     slot = window[f]
     height = depth_images.shape[1]
     width = depth_images.shape[2]
-    state = wp.rand_init(seed, tid)
+    state = wp.rand_init(seeds[iteration[0]], tid)
     u = wp.randi(state, edge_u, width - edge_u)
     v = wp.randi(state, edge_v, height - edge_v)
     frame[tid] = f
@@ -195,7 +199,9 @@ def place_ray(
 
 @wp.kernel(enable_backward=False)
 def place_samples(
-    seed: int,
+    start: int,
+    seeds: wp.array(dtype=int),
+    iteration: wp.array(dtype=int),
     jitter: int,
     count: int,
     surface_count: int,
@@ -206,7 +212,7 @@ def place_samples(
     max_depth: wp.array(dtype=float),
     z: wp.array(dtype=float),
 ):
-    tid = wp.tid()
+    tid = start + wp.tid()
     if keep[tid] == 0:
         return
     near = float(0.01)
@@ -218,12 +224,13 @@ def place_samples(
         largest = max_depth[0]
         near = 0.01 * measured
         far = wp.clamp(far, 0.0, 1.2 * largest)
-    state = wp.rand_init(seed ^ 0x5BD1E995, tid)
+    state = wp.rand_init(seeds[iteration[0]] ^ 0x5BD1E995, tid)
     place_ray(tid, count, surface_count, near, far, measured, largest, jitter, state, z)
 
 
 @wp.kernel(enable_backward=False)
 def collect_ray_gradients(
+    start: int,
     sample_count: int,
     keep: wp.array(dtype=int),
     z: wp.array(dtype=float),
@@ -232,7 +239,7 @@ def collect_ray_gradients(
     direction_grad: wp.array(dtype=wp.vec3),
 ):
     """Adjoint of p = o + z d, summed over the samples of a ray; clears ``point_grad`` for the next iteration."""
-    tid = wp.tid()
+    tid = start + wp.tid()
     if keep[tid] == 0:
         return
     do = wp.vec3()
