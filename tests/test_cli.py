@@ -7,6 +7,7 @@ import pytest
 
 from tests.fakes import FakeSequence, FakeSlam, wall
 from warpslam import cli, demo, pipeline, revisit
+from warpslam.cli.common import parse_frames
 from warpslam.evaluation import read_tum
 from warpslam.run_folder import read_json
 
@@ -115,7 +116,7 @@ def test_wrong_arguments_exit_2(arguments, capsys):
 )
 def test_frames_are_a_python_slice(text, expected):
     """A:B:STEP with any part left out."""
-    assert cli.parse_frames(text) == expected
+    assert parse_frames(text) == expected
 
 
 def test_eval_prints_figures(faked, tmp_path, capsys):

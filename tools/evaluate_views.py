@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warpslam.cli import parse_frames
+from warpslam.cli.common import parse_frames
 from warpslam.errors import WarpSlamError
 from warpslam.pipeline import psnr
 from warpslam.sequences import Frame, open_sequence

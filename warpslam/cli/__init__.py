@@ -1,0 +1,46 @@
+"""The ``warpslam`` command: a module for each command, which reads arguments, calls the library and prints."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from warpslam import __version__
+from warpslam.cli import evaluate, info, mesh, render, run
+from warpslam.cli.common import EXIT_ERROR, EXIT_INTERRUPTED
+from warpslam.errors import WarpSlamError
+
+COMMANDS = (run, evaluate, render, mesh, info)
+"""Modules with a function ``add(commands)``, in the order of ``warpslam --help``."""
+
+
+def entry_point() -> None:
+    """Console script."""
+    sys.exit(main())
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code: 0, 2 after an error in the input, 130 after ctrl-C."""
+    options = _parser().parse_args(arguments)
+    try:
+        return options.command(options)
+    except WarpSlamError as error:
+        if options.debug:
+            raise
+        print(f"warpslam: {error}", file=sys.stderr)
+        return EXIT_ERROR
+    except KeyboardInterrupt:
+        print("warpslam: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="warpslam", description="Dense RGB-D SLAM with a neural implicit map (NICE-SLAM) in NVIDIA Warp."
+    )
+    parser.add_argument("--version", action="version", version=f"warpslam {__version__}")
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    for module in COMMANDS:
+        module.add(commands)
+    return parser
