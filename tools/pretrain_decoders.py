@@ -11,6 +11,7 @@ continues from checkpoint.pt where there is one. It uses a CUDA device if torch 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import os
 import sys
@@ -101,8 +102,11 @@ def evaluate(options: argparse.Namespace) -> int:
 
 
 def export(options: argparse.Namespace) -> int:
-    """Copy the trained decoders to a file of tensors alone, and read it back."""
+    """Copy the trained decoders to a file of tensors alone, and read it back; the coarse one from another run if asked.
+    """
     decoders = load_decoders(options.out / "decoders.pth")
+    if options.coarse_from:
+        decoders = dataclasses.replace(decoders, coarse=load_decoders(options.coarse_from).coarse)
     decoders.save(options.to)
     state, again = decoders.state_dict(), load_decoders(options.to).state_dict()
     assert all(np.array_equal(state[name], again[name]) for name in state)
@@ -201,6 +205,7 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--seed", type=int, default=0, help="seed of the random decoders")
     command.set_defaults(run=evaluate)
     command = commands.add_parser("export", parents=[shared], help="write the package's file")
+    command.add_argument("--coarse-from", type=Path, help="take the coarse decoder from this file")
     command.add_argument("--to", type=Path, default=ROOT / "warpslam" / "data" / "decoders.pth")
     command.set_defaults(run=export)
     return parser
