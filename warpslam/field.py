@@ -409,7 +409,7 @@ class RayBatch:
         if self._activations.shape[0] < size:
             self._activations = wp.empty((size, 5), dtype=Vec32, device=self.device)
             if self.kernels.sums_weights_apart:
-                self._layer_grad = wp.empty((size, 13), dtype=Vec32, device=self.device)
+                self._layer_grad = wp.empty((size, 14), dtype=Vec32, device=self.device)
 
     def _adjoint(
         self, arrays: FieldArrays, stage: str, gradients: Gradients, thresholds: Thresholds
@@ -441,9 +441,8 @@ class RayBatch:
         last: list[wp.Launch] = []
         if want_weights and stage == "color" and self.kernels.sums_weights_apart:
             chunk, points = 256, self.count * samples
-            inputs = [points, chunk, samples, self.origin, self.direction, self.z, arrays.lattices["color"]]
-            inputs += [arrays.features["color"], arrays.decoders["color"].weights, self._activations, self.color_grad]
-            inputs += [self._layer_grad, gradients.color_weights]
+            inputs = [points, chunk, samples, self.origin, self.direction, self.z, arrays.decoders["color"].weights]
+            inputs += [self._activations, self.color_grad, self._layer_grad, gradients.color_weights]
             dim = (-(-points // chunk), decoder.COLOR_WEIGHT_ROWS)
             last.append(self.launcher.command(self.kernels.color_weights, dim, inputs))
 

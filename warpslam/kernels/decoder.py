@@ -738,6 +738,7 @@ def decoder_kernels(target: str) -> SimpleNamespace:
                             coordinate[p] = positions[p, axis]
                         add_sum(weight_grad, slot, B + 3 * chunk + axis, scaled(coordinate, da))
             else:
+                store_rows(layer_grad, samples, 13, look_up(positions, lattice, features), keep)
                 for chunk in range(3):
                     da = angle_adjoint(positions, W, T, chunk, a0, a3, trips)
                     store_rows(layer_grad, samples, 10 + chunk, da, keep)
@@ -831,16 +832,15 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         ray_origin: wp.array(dtype=wp.vec3),
         ray_direction: wp.array(dtype=wp.vec3),
         z: wp.array(dtype=float),
-        lattice: Lattice,
-        features: wp.array(dtype=Vec32),
         W: wp.array(dtype=Vec32),
         activations: wp.array2d(dtype=Vec32),
         color_grad: wp.array(dtype=wp.vec3),
         layer_grad: wp.array2d(dtype=Vec32),
         weight_grad: wp.array2d(dtype=Vec32),
     ):
-        """Sum the weight gradient over a chunk of points: x^T d for each layer, one thread a row of the weights
-        (CUDA).
+        """Sum the weight gradient over a chunk of points: x^T d for each layer, one thread a row of the weights (CUDA).
+
+        layer_grad: of a point, as `color_backward` left it: a_0..a_4, g_0..g_4, those of the angles, and the feature.
         """
         block, row = wp.tid()
         first = block * chunk_size
@@ -849,43 +849,36 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         for n in range(first, last):
             d = color_grad[n]
             if d[0] != 0.0 or d[1] != 0.0 or d[2] != 0.0:
+                x = float(1.0)
+                column = int(0)
                 if row < E0:
                     chunk = row // 3
-                    p = sample_point(n, sample_count, ray_origin, ray_direction, z)
-                    total += p[row - 3 * chunk] * layer_grad[n, 10 + chunk]
+                    x = sample_point(n, sample_count, ray_origin, ray_direction, z)[row - 3 * chunk]
+                    column = 10 + chunk
                 elif row < W1:
                     j = row - E0
-                    layer = int(0)
                     if j >= 96:
                         j -= 96
-                        layer = int(3)
+                        column = 3
                     p = sample_point(n, sample_count, ray_origin, ray_direction, z)
-                    chunk = j // 32
-                    lane = j - 32 * chunk
-                    angle = (
-                        p[0] * W[B + 3 * chunk][lane]
-                        + p[1] * W[B + 3 * chunk + 1][lane]
-                        + p[2] * W[B + 3 * chunk + 2][lane]
-                    )
-                    total += sine_cosine(angle)[0] * layer_grad[n, layer]
+                    x = sine_cosine(angles(p, W, j // 32)[j % 32])[0]
                 elif row < BIAS:
                     layer = (row - W1) // 32
-                    total += activations[n, layer][row - W1 - 32 * layer] * layer_grad[n, layer + 1]
+                    x = activations[n, layer][row - W1 - 32 * layer]
+                    column = layer + 1
                 elif row < V:
-                    total += layer_grad[n, row - BIAS]
+                    column = row - BIAS
                 elif row < OUT_32:
                     layer = (row - V) // 32
-                    p = sample_point(n, sample_count, ray_origin, ray_direction, z)
-                    c = interpolate(features, lattice, find_cell(lattice, p))
-                    total += c[row - V - 32 * layer] * layer_grad[n, 5 + layer]
+                    x = layer_grad[n, 13][row - V - 32 * layer]
+                    column = 5 + layer
+                if row < OUT_32:
+                    total += x * layer_grad[n, column]
                 elif row < OUT_32 + 3:
                     total += d[row - OUT_32] * activations[n, 4]
                 else:
-                    bias = Vec32()
-                    bias[0] = d[0]
-                    bias[1] = d[1]
-                    bias[2] = d[2]
-                    total += bias
+                    for k in range(3):
+                        total[k] += d[k]
         wp.atomic_add(weight_grad, 0, row, total)
 
     @kernel
