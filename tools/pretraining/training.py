@@ -64,6 +64,7 @@ class TrainingConfig:
     label_weight: float = 0.3  # of the cross entropy [nats] beside the depth error [m] in phase 2
     coarse_label_weight: float = 2.0  # the same for the coarse level, whose labels reach beyond what is seen
     residual_weight: float = 50.0  # of the squared fine logit where the fine feature is zero
+    quiet_band: float = 0.02  # fine logits there up to this cost nothing
     feature_scale: float = 1.0  # on FEATURE_SCALE
     feature_weight: float = 1e-3  # of the squared features of the encoder, before FEATURE_SCALE
 
@@ -264,13 +265,18 @@ class Trainer:
         return self.decoders.weights()
 
     def _silence(self, points: Tensor, middle: Tensor) -> Tensor:
-        """Mean squared fine logit at zero fine feature, for real middle features and for noise of up to 3 x them."""
+        """Mean square of what the fine logit exceeds the quiet band by where the fine feature is zero.
+
+        For real middle features and for noise of up to 3 x them. The band leaves the decoder free to answer small
+        features: without it, a weight that silences the last points also slows the fine level down.
+        """
         draws = torch.rand(2, len(points), 1, generator=self.generator).to(self.device)
         noise = torch.randn(middle.shape, generator=self.generator).to(self.device)
         noise = middle.detach().std() * (0.3 + 2.7 * draws[0]) * noise
         shifted = middle.detach() + torch.where(draws[1] < 0.5, torch.zeros_like(noise), noise)
         mixed = torch.where(draws[1] < 0.75, shifted, noise)
-        return self.decoders.residual(points, torch.zeros_like(middle), mixed).square().mean()
+        residual = self.decoders.residual(points, torch.zeros_like(middle), mixed)
+        return F.relu(residual.abs() - self.config.quiet_band).square().mean()
 
     def _mapping_step(self, scene: dict[str, Any], stage: str) -> dict[str, float]:
         pool: RayPool = scene["pool"]
