@@ -107,7 +107,7 @@ def run(
     Raises:
         WarpSlamError: The input or a setting can't be used. metrics.json is written even so.
     """
-    selected = _select(sequence, frames)
+    selected = select_frames(sequence, frames)
     folder = RunFolder.create(output, sequence.name)
     with _log_file(folder.log):
         run_ = _Run(sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame, on_module)
@@ -560,7 +560,7 @@ def psnr(rendered: np.ndarray, rgb: np.ndarray) -> float:
     return float(-10 * np.log10(max(mean_square, 1e-12)))
 
 
-def _select(sequence: RgbdSequence, frames: slice | None) -> range:
+def select_frames(sequence: RgbdSequence, frames: slice | None) -> range:
     frames = slice(None) if frames is None else frames
     if frames.step is not None and frames.step < 1:
         raise ConfigError(f"frames: step {frames.step} must be at least 1; SLAM goes forward in time")

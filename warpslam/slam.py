@@ -19,6 +19,7 @@ from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth
 from warpslam.launching import synchronize
 from warpslam.mapper import Mapper
 from warpslam.meshing import ObservedView, extract_mesh
+from warpslam.profiling import phase
 from warpslam.rendering import RenderedImage, render_image
 from warpslam.scene import SceneMap
 from warpslam.tracker import Tracker, TrackingResult
@@ -344,17 +345,20 @@ class Slam:
 
 
 class _timed:
-    """Adds the wall-clock seconds of a block to ``timings[name]``."""
+    """Adds the wall-clock seconds of a block to ``timings[name]``; the block is a phase for the profiler."""
 
     def __init__(self, timings: dict[str, float], name: str, device: wp.Device) -> None:
         self.timings, self.name, self.device = timings, name, device
+        self.phase = phase(name)
 
     def __enter__(self) -> None:
+        self.phase.__enter__()
         self.start = time.perf_counter()
 
     def __exit__(self, *_: object) -> None:
         synchronize(self.device)
         self.timings[self.name] = self.timings.get(self.name, 0.0) + time.perf_counter() - self.start
+        self.phase.__exit__()
 
 
 def _to_numpy(array: Any) -> np.ndarray:

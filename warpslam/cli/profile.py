@@ -1,0 +1,96 @@
+"""``warpslam profile``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from warpslam.cli.common import add_command, parse_frames, quiet_warp, warnings_on_stderr
+
+if TYPE_CHECKING:
+    from warpslam.config import Config
+    from warpslam.profiling.recorder import Profile
+    from warpslam.run_folder import Source
+    from warpslam.sequences.base import RgbdSequence
+
+
+def add(commands: Any) -> None:
+    """Add the command."""
+    profile = add_command(commands, "profile", _profile, "time of every kernel of a run; writes no run folder")
+    profile.add_argument("folder", metavar="FOLDER|demo", help="folder of one sequence, or the built-in one")
+    profile.add_argument("--dataset", default="auto", help="format of the folder (default: told from its file names)")
+    profile.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
+    profile.add_argument("--preset", help="settings to start from (default: the dataset's)")
+    profile.add_argument("--frames", type=parse_frames, metavar="A:B:STEP", help="frames to use, as in a Python slice")
+    profile.add_argument(
+        "--set", dest="overrides", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
+        help="settings, such as mapping.iterations=30",
+    )  # fmt: skip
+    profile.add_argument("--device", help="cpu, cuda:0, ... (default: a GPU if there is one)")
+    profile.add_argument("--seed", type=int, default=0, help="seed of every random choice (0)")
+    profile.add_argument("--no-mesh", action="store_true", help="leave out the mesh")
+    profile.add_argument("--json", metavar="FILE", help="write the figures as JSON")
+    profile.add_argument("--trace", metavar="FILE", help="write a trace for Perfetto or chrome://tracing")
+
+
+def _profile(options: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from warpslam.pipeline import select_frames
+
+    quiet_warp()
+    sequence, config = _input(options)
+    selected = select_frames(sequence, options.frames)
+    with warnings_on_stderr():
+        profile = _run(sequence, config, selected, options)
+    console = Console()
+    if not console.is_terminal:
+        # Wide enough for every column, whoever reads it.
+        console = Console(width=170)
+    for table in profile.report.tables():
+        console.print(table)
+    if options.json:
+        Path(options.json).write_text(profile.to_json() + "\n", encoding="utf-8")
+        print(f"figures     {options.json}")
+    if options.trace:
+        profile.write_trace(options.trace)
+        print(f"trace       {options.trace} (open it at ui.perfetto.dev)")
+    return 0
+
+
+def _input(options: argparse.Namespace) -> tuple[RgbdSequence, Config]:
+    from warpslam import demo
+    from warpslam.config import Config
+    from warpslam.revisit import open_source
+    from warpslam.run_folder import Source
+
+    if options.folder == "demo":
+        preset, overrides = options.preset or demo.PRESET, [*demo.OVERRIDES, *options.overrides]
+        return open_source(Source(None)), Config.from_preset(preset, overrides)
+    source: Source = Source(str(Path(options.folder).expanduser().resolve()), options.dataset, options.camera)
+    sequence = open_source(source)
+    return sequence, Config.from_preset(options.preset or sequence.preset, options.overrides)
+
+
+def _run(sequence: RgbdSequence, config: Config, selected: range, options: argparse.Namespace) -> Profile:
+    from warpslam import profile
+    from warpslam.errors import MeshError
+    from warpslam.pipeline import build_slam, load_kernels
+    from warpslam.profiling import phase
+
+    with profile() as result:
+        with phase("kernels"):
+            load_kernels(sequence, options.device)
+        slam = build_slam(sequence.intrinsics, config, options.device, options.seed)
+        for index in selected:
+            with phase("reading"):
+                frame = sequence[index]
+            slam.step(frame.rgb, frame.depth, frame.timestamp, frame.T_world_camera)
+        slam.finish()
+        if not options.no_mesh:
+            try:
+                slam.mesh()
+            except MeshError as error:
+                print(f"no mesh     {error}")
+    return result
