@@ -110,7 +110,7 @@ def _each(
     finished: list[ModuleProgress] = []
 
     def one(name: str) -> None:
-        module = _module(name)
+        module = find_module(name)
         before = set(_binaries(module, target))
         with lock:
             if report is not None:
@@ -134,7 +134,8 @@ def _each(
     return finished
 
 
-def _module(name: str) -> wp.Module:
+def find_module(name: str) -> wp.Module:
+    """A Warp module by name, importing the Python module that builds it."""
     importlib.import_module(_PYTHON_MODULES.get(name, name))
     return wp.get_module(name)
 

@@ -80,9 +80,9 @@ def _run(sequence: RgbdSequence, config: Config, selected: range, options: argpa
     from warpslam.profiling import phase
 
     with profile() as result:
-        with phase("kernels"):
+        with phase("setup"):
             load_kernels(sequence, options.device)
-        slam = build_slam(sequence.intrinsics, config, options.device, options.seed)
+            slam = build_slam(sequence.intrinsics, config, options.device, options.seed)
         for index in selected:
             with phase("reading"):
                 frame = sequence[index]
