@@ -20,7 +20,7 @@ from warpslam.field import Thresholds
 from warpslam.profiling import costs, phase, phases, recorder
 from warpslam.synthetic import SyntheticSequence
 
-SETTINGS = ("tracking.optimizer=adam", "mapping.bundle_adjustment_keyframes=1", "mapping.first_iterations=30")
+SETTINGS = ("tracking.optimizer=adam", "mapping.first_iterations=12", "mapping.iterations=6")
 KERNELS = {
     "fill_grid", "project_vertices", "select_vertices", "clear_moments", "draw_pixels", "cast_rays", "bound_rays",
     "place_samples", "start_rays", "coarse_forward", "coarse_backward", "middle_forward", "fine_forward",
@@ -38,9 +38,9 @@ HOOKED = (
 
 @pytest.fixture(scope="module")
 def frames():
-    """Four frames of a furnished room."""
+    """Three frames of a furnished room."""
     sequence = SyntheticSequence(1, 8, intrinsics=CAMERA)
-    return [sequence[n] for n in range(4)]
+    return [sequence[n] for n in range(3)]
 
 
 @pytest.fixture(autouse=True)
@@ -61,10 +61,10 @@ def run(frames):
         patch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
         slam = new_slam(*SETTINGS)
         with warpslam.profile() as profile:
-            results = steps(slam, frames)
-            slam.finish()
-            slam.mesh()
-    return profile, results, slam
+            timings = [result.timings for result in steps(slam, frames)]
+            timings.append(slam.finish())
+            slam.mesh(voxel=0.1)
+    return profile, timings, slam
 
 
 def test_every_kernel_that_ran_appears(run):
@@ -75,25 +75,27 @@ def test_every_kernel_that_ran_appears(run):
     calls = Counter()
     for row in report["kernels"]:
         calls[row["kernel"], row["phase"]] += row["calls"]
-    tracking = slam.config.tracking.iterations * 3
+    tracking = slam.config.tracking.iterations * 2
     assert calls["note_pose", "tracking / optimize"] == tracking
     assert calls["geometry_backward", "tracking / optimize"] == 2 * 2 * tracking
     assert report["launches"] == sum(calls.values())
     phases_seen = {row["phase"] for row in report["phases"]}
-    assert {f"mapping / {p}" for p in ("coarse", "middle", "fine", "color", "growth", "frustum selection")} < phases_seen
+    assert {
+        f"mapping / {p}" for p in ("coarse", "middle", "fine", "color", "growth", "frustum selection")
+    } < phases_seen
     assert {"mapping / keyframe selection", "tracking / judge", "refinement / color", "meshing"} < phases_seen
 
 
 def test_phases_agree_with_the_clock(run):
     """Walls add up to the whole; the parts of each fit into it; tracking is what the frames say it took."""
-    profile, results, _ = run
+    profile, timings, _ = run
     rows = profile.report.phases
     assert sum(row.wall for row in rows) == pytest.approx(profile.wall_seconds, rel=1e-6)
     for row in rows:
         parts = (row.kernels, row.launch, row.wait, row.load, row.profiler)
         assert min(parts) >= 0 and row.python > -1e-4 and sum(parts) + row.python == pytest.approx(row.wall)
-    for name in ("tracking", "mapping"):
-        measured = sum(result.timings.get(name, 0.0) for result in results)
+    for name in ("tracking", "mapping", "refinement"):
+        measured = sum(times.get(name, 0.0) for times in timings)
         profiled = sum(row.wall for row in rows if row.phase.split(" / ")[0] == name)
         assert profiled == pytest.approx(measured, rel=0.02, abs=0.005)
     kernels = sum(row.seconds for row in profile.report.kernels)
@@ -112,7 +114,8 @@ def test_rates_follow_from_points_and_time(run):
     assert fine.gflop == pytest.approx(fine.points * 40_961e-9)
     assert fine.gflops == pytest.approx(fine.gflop / fine.wall) and fine.peak_share == pytest.approx(fine.gflops / 100)
     assert 0.5 * fine.seconds <= fine.wall <= fine.seconds
-    assert fine.mean_ms == pytest.approx(1e3 * fine.seconds / fine.calls) and fine.p95_ms >= fine.mean_ms / 2
+    times = [1e3 * (x.stop - x.start) for x in run[0].launches if (x.kernel, x.path) == (fine.kernel, fine.phase)]
+    assert fine.mean_ms == pytest.approx(np.mean(times)) and fine.p95_ms == pytest.approx(np.percentile(times, 95))
     adam = rows["adam_rows", "mapping / middle"]
     assert adam.gflop is None and adam.gigabytes_per_second == pytest.approx(adam.gigabytes / adam.wall)
     loss = rows["mapping_loss", "mapping / middle"]
@@ -213,7 +216,7 @@ def test_phases_nest_and_follow_the_thread():
 @pytest.mark.parametrize("min_transmittance", [0.0, 0.3])
 def test_counted_points_are_those_computed(frames, min_transmittance, monkeypatch):
     """The points counted beforehand are the ones whose outputs a kernel then writes."""
-    slam = new_slam("mapping.first_iterations=60", "mapping.pixels=200")
+    slam = new_slam("mapping.first_iterations=60", "mapping.coarse=false")
     steps(slam, frames[:1])
     batch, arrays = slam._mapper._batch, slam.scene.arrays()
     thresholds = Thresholds(min_weight=0.02, min_transmittance=min_transmittance)
@@ -234,14 +237,12 @@ def test_counted_points_are_those_computed(frames, min_transmittance, monkeypatc
 
     # Adjoints: points with a gradient above the threshold get a derivative by their position.
     gradient = np.zeros(batch.logit_grad.shape[0], np.float32)
-    gradient[: total : 3] = np.linspace(-1, 1, len(gradient[: total : 3]))
+    gradient[:total:3] = np.linspace(-1, 1, len(gradient[:total:3]))
     batch.logit_grad.assign(gradient)
     batch.point_grad.zero_()
     from warpslam.field import Gradients
 
-    step = batch._geometry_adjoint(
-        arrays, "middle", Gradients(points=True), 0, batch.count, 0, 0.25, batch.point_grad
-    )
+    step = batch._geometry_adjoint(arrays, "middle", Gradients(points=True), 0, batch.count, 0, 0.25, batch.point_grad)
     with warpslam.profile() as profile:
         batch.launcher.launch(*step)
     (launch,) = profile.launches
@@ -303,5 +304,7 @@ def test_command_line(monkeypatch, tmp_path, capsys):
     assert cli.main([*arguments, "--json", files[0], "--trace", files[1]]) == 0
     out = capsys.readouterr().out
     assert "tracking / optimize" in out and "middle_forward" in out and files[1] in out
-    assert {"setup", "reading", "meshing"} <= {row["phase"] for row in json.loads((tmp_path / "p.json").read_text())["phases"]}
+    assert {"setup", "reading", "meshing"} <= {
+        row["phase"] for row in json.loads((tmp_path / "p.json").read_text())["phases"]
+    }
     assert json.loads((tmp_path / "t.json").read_text())["traceEvents"]

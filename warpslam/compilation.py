@@ -20,7 +20,10 @@ import warp as wp
 from warpslam.errors import ConfigError
 
 _STAGES = ("gauss_newton", "rays", "adam", "compositing", "losses", "grid", "frustum")
-_PYTHON_MODULES = {"warpslam.decoder_cpu": "warpslam.kernels.decoder", "warpslam.decoder_cuda": "warpslam.kernels.decoder"}
+_PYTHON_MODULES = {
+    "warpslam.decoder_cpu": "warpslam.kernels.decoder",
+    "warpslam.decoder_cuda": "warpslam.kernels.decoder",
+}
 _WORKERS = 2
 _BINARIES = {"cpu": (".o",), "cuda": (".ptx", ".cubin")}
 
@@ -50,9 +53,7 @@ def module_names(target: str) -> list[str]:
     return [f"warpslam.decoder_{target}", *(f"warpslam.kernels.{stage}" for stage in _STAGES), "warpslam.meshing"]
 
 
-def compile_kernels(
-    device: wp.Device, report: Report | None = None, extra: Sequence[str] = ()
-) -> list[ModuleProgress]:
+def compile_kernels(device: wp.Device, report: Report | None = None, extra: Sequence[str] = ()) -> list[ModuleProgress]:
     """Load every module of a run for ``device``, compiling those that the kernel cache does not hold.
 
     Args:

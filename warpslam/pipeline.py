@@ -561,6 +561,11 @@ def psnr(rendered: np.ndarray, rgb: np.ndarray) -> float:
 
 
 def select_frames(sequence: RgbdSequence, frames: slice | None) -> range:
+    """Numbers of the frames to use, all by default.
+
+    Raises:
+        ConfigError: The slice selects none, or goes backwards.
+    """
     frames = slice(None) if frames is None else frames
     if frames.step is not None and frames.step < 1:
         raise ConfigError(f"frames: step {frames.step} must be at least 1; SLAM goes forward in time")

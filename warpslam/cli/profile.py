@@ -6,30 +6,30 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from warpslam.cli.common import add_command, parse_frames, quiet_warp, warnings_on_stderr
+from warpslam.cli.common import (
+    add_command,
+    add_sequence_options,
+    add_slam_options,
+    quiet_warp,
+    warnings_on_stderr,
+)
 
 if TYPE_CHECKING:
     from warpslam.config import Config
     from warpslam.profiling.recorder import Profile
-    from warpslam.run_folder import Source
     from warpslam.sequences.base import RgbdSequence
+
+_MIN_SHARE = 0.002
 
 
 def add(commands: Any) -> None:
     """Add the command."""
     profile = add_command(commands, "profile", _profile, "time of every kernel of a run; writes no run folder")
     profile.add_argument("folder", metavar="FOLDER|demo", help="folder of one sequence, or the built-in one")
-    profile.add_argument("--dataset", default="auto", help="format of the folder (default: told from its file names)")
-    profile.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
-    profile.add_argument("--preset", help="settings to start from (default: the dataset's)")
-    profile.add_argument("--frames", type=parse_frames, metavar="A:B:STEP", help="frames to use, as in a Python slice")
-    profile.add_argument(
-        "--set", dest="overrides", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
-        help="settings, such as mapping.iterations=30",
-    )  # fmt: skip
-    profile.add_argument("--device", help="cpu, cuda:0, ... (default: a GPU if there is one)")
-    profile.add_argument("--seed", type=int, default=0, help="seed of every random choice (0)")
+    add_sequence_options(profile)
+    add_slam_options(profile)
     profile.add_argument("--no-mesh", action="store_true", help="leave out the mesh")
+    profile.add_argument("--all", action="store_true", help=f"show kernels below {_MIN_SHARE:.1%} of the time, too")
     profile.add_argument("--json", metavar="FILE", help="write the figures as JSON")
     profile.add_argument("--trace", metavar="FILE", help="write a trace for Perfetto or chrome://tracing")
 
@@ -41,6 +41,8 @@ def _profile(options: argparse.Namespace) -> int:
 
     quiet_warp()
     sequence, config = _input(options)
+    if options.decoders:
+        config = config.model_copy(update={"decoders": options.decoders})
     selected = select_frames(sequence, options.frames)
     with warnings_on_stderr():
         profile = _run(sequence, config, selected, options)
@@ -48,7 +50,7 @@ def _profile(options: argparse.Namespace) -> int:
     if not console.is_terminal:
         # Wide enough for every column, whoever reads it.
         console = Console(width=170)
-    for table in profile.report.tables():
+    for table in profile.report.tables(0.0 if options.all else _MIN_SHARE):
         console.print(table)
     if options.json:
         Path(options.json).write_text(profile.to_json() + "\n", encoding="utf-8")
@@ -68,7 +70,7 @@ def _input(options: argparse.Namespace) -> tuple[RgbdSequence, Config]:
     if options.folder == "demo":
         preset, overrides = options.preset or demo.PRESET, [*demo.OVERRIDES, *options.overrides]
         return open_source(Source(None)), Config.from_preset(preset, overrides)
-    source: Source = Source(str(Path(options.folder).expanduser().resolve()), options.dataset, options.camera)
+    source = Source(str(Path(options.folder).expanduser().resolve()), options.dataset, options.camera)
     sequence = open_source(source)
     return sequence, Config.from_preset(options.preset or sequence.preset, options.overrides)
 

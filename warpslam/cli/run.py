@@ -13,8 +13,8 @@ from warpslam.cli.common import (
     EXIT_INTERRUPTED,
     add_command,
     add_run_options,
+    add_sequence_options,
     duration,
-    parse_frames,
     print_reconstruction,
     quiet_warp,
     warnings_on_stderr,
@@ -36,10 +36,7 @@ def add(commands: Any) -> None:
     """Add both commands."""
     run = add_command(commands, "run", _run, "trajectory and coloured mesh of a folder of RGB-D frames")
     run.add_argument("folder", metavar="FOLDER", help="folder of one sequence")
-    run.add_argument("--dataset", default="auto", help="format of the folder (default: told from its file names)")
-    run.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
-    run.add_argument("--preset", help="settings to start from (default: the dataset's)")
-    run.add_argument("--frames", type=parse_frames, metavar="A:B:STEP", help="frames to use, as in a Python slice")
+    add_sequence_options(run)
     run.add_argument("--truth-mesh", metavar="FILE", help="true surface, for the reconstruction metrics")
     add_run_options(run)
 

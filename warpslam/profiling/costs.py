@@ -15,7 +15,7 @@ import ctypes
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -78,12 +78,12 @@ class Arguments:
         )
 
 
-@lru_cache(maxsize=None)
+@cache
 def _positions(kernel: wp.Kernel) -> dict[str, int]:
     return {argument.label: n for n, argument in enumerate(kernel.adj.args)}
 
 
-@lru_cache(maxsize=None)
+@cache
 def backward_flops(level: str, *, points: bool, weights: bool) -> int:
     """Operations of a decoder's adjoint at one point.
 
@@ -223,8 +223,13 @@ _MODELS: dict[str, Model] = {
     **{
         name: _samples("sample_count")
         for name in (
-            "ray_variance", "composite_color", "composite_backward", "surface_depth", "collect_ray_gradients",
-            "ray_derivatives", "ray_jacobians",
+            "ray_variance",
+            "composite_color",
+            "composite_backward",
+            "surface_depth",
+            "collect_ray_gradients",
+            "ray_derivatives",
+            "ray_jacobians",
         )
     },  # fmt: skip
     "adam_rows": _adam_rows,

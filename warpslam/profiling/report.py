@@ -112,9 +112,12 @@ class Report:
             }
         )
 
-    def tables(self) -> list[Table]:
-        """Tables for `rich`: phases, kernels, and modules if any was loaded."""
-        tables = [self._phase_table(), self._kernel_table()]
+    def tables(self, min_share: float = 0.0) -> list[Table]:
+        """Tables for `rich`: phases, kernels, and modules if any was loaded.
+
+        min_share: Kernels with less than this share of the time are summed in one row.
+        """
+        tables = [self._phase_table(), self._kernel_table(min_share)]
         return [*tables, self._module_table()] if self.modules else tables
 
     def table(self, width: int) -> str:
@@ -135,11 +138,12 @@ class Report:
             table.add_row(row.phase, str(row.calls), *(f"{getattr(row, part):.3f}" for part in parts))
         return table
 
-    def _kernel_table(self) -> Table:
+    def _kernel_table(self, min_share: float) -> Table:
         title = f"Kernels (matrix product on all cores: {self.peak_gflops:.0f} GFLOP/s)"
         columns = ["calls", "total s", "mean ms", "p95 ms", "share", "Mpoint/s", "GFLOP/s", "of peak", "GB/s"]
         table = _table(title, ["kernel", "phase"], columns)
-        for row in self.kernels:
+        small = [row for row in self.kernels if row.share < min_share]
+        for row in self.kernels[: len(self.kernels) - len(small)]:
             bound = "" if row.counted else "<= "
             table.add_row(
                 row.kernel,
@@ -154,6 +158,10 @@ class Report:
                 _optional(row.peak_share, 100.0, "{:.0f} %", bound),
                 _optional(row.gigabytes_per_second, 1.0, "{:.2f}"),
             )
+        if small:
+            calls, seconds = sum(row.calls for row in small), sum(row.seconds for row in small)
+            share = sum(row.share for row in small)
+            table.add_row(f"{len(small)} more", "", str(calls), f"{seconds:.3f}", "", "", f"{share:.1%}")
         return table
 
     def _module_table(self) -> Table:
