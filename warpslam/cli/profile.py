@@ -29,7 +29,7 @@ def add(commands: Any) -> None:
     add_sequence_options(profile)
     add_slam_options(profile)
     profile.add_argument("--no-mesh", action="store_true", help="leave out the mesh")
-    profile.add_argument("--all", action="store_true", help=f"show kernels below {_MIN_SHARE:.1%} of the time, too")
+    profile.add_argument("--all", action="store_true", help="show kernels with hardly any share of the time, too")
     profile.add_argument("--json", metavar="FILE", help="write the figures as JSON")
     profile.add_argument("--trace", metavar="FILE", help="write a trace for Perfetto or chrome://tracing")
 
@@ -37,13 +37,18 @@ def add(commands: Any) -> None:
 def _profile(options: argparse.Namespace) -> int:
     from rich.console import Console
 
+    from warpslam.errors import ConfigError
     from warpslam.pipeline import select_frames
 
     quiet_warp()
+    for option, file in (("--json", options.json), ("--trace", options.trace)):
+        if file and not Path(file).resolve().parent.is_dir():
+            raise ConfigError(f"{option} {file}: there is no folder {Path(file).resolve().parent}; make it first")
     sequence, config = _input(options)
     if options.decoders:
         config = config.model_copy(update={"decoders": options.decoders})
     selected = select_frames(sequence, options.frames)
+    print(f"profiling {len(selected)} frames of {sequence.name}", flush=True)
     with warnings_on_stderr():
         profile = _run(sequence, config, selected, options)
     console = Console()
