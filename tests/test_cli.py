@@ -80,6 +80,8 @@ def test_interrupted_run_exits_130_with_partial_results(faked, tmp_path, monkeyp
         (["demo", "--set", "mapping.windw=3"], "mapping.windw"),
         (["demo", "--set", "mapping"], "mapping"),
         (["demo", "--device", "cuda:77"], "cuda:77"),
+        (["profile", "demo", "--frames", "0:2", "--device", "cuda:77"], "cuda:77"),
+        (["profile", "demo", "--json", "/no/such/folder/p.json"], "/no/such/folder"),
     ],
 )
 def test_errors_are_one_line_and_exit_2(arguments, message, tmp_path, capsys):
@@ -188,8 +190,17 @@ def test_info_names_versions_devices_and_decoders(capsys, tmp_path):
     random_decoders().save(tmp_path / "d.pth")
     assert cli.main(["info", "--decoders", str(tmp_path / "d.pth")]) == 0
     out = capsys.readouterr().out
-    for word in ("warpslam", "warp-lang", "torch", "cpu", "d.pth", "'coarse': 32", "replica", "tum_rgbd"):
+    for word in ("warpslam", "warp-lang", "torch", "cpu", "d.pth", "'coarse': 32", "replica", "tum_rgbd", "40,961", "443,908"):
         assert word in out, word
+
+
+@pytest.mark.parametrize("command", [module.__name__.rpartition(".")[2] for module in cli.COMMANDS])
+def test_each_command_explains_itself(command, capsys):
+    """``--help`` of every command can be formatted, and names its options."""
+    with pytest.raises(SystemExit) as exit_:
+        cli.main([{"evaluate": "eval"}.get(command, command), "--help"])
+    assert exit_.value.code == 0
+    assert "--debug" in capsys.readouterr().out
 
 
 def test_version(capsys):

@@ -61,8 +61,8 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
     assert metrics["rendering"]["depth_l1_m"] == pytest.approx(0.03, abs=1e-6)
     assert metrics["rendering"]["frames"] == [0, 2, 5, 7]
     assert metrics["mesh"]["faces"] == 2
-    assert metrics["seconds"]["kernel_compile"] == 0.25 and metrics["device"] == "cpu"
-    assert metrics["seconds"]["run"] == pytest.approx(metrics["seconds"]["total"] - 0.25)
+    assert metrics["seconds"]["kernel_compile"] >= 0.25 and metrics["device"] == "cpu"
+    assert metrics["seconds"]["run"] == metrics["seconds"]["total"] - metrics["seconds"]["kernel_compile"]
     assert metrics["seconds"]["frames"] > 0
     assert fake_slam.made[-1].finished
     mesh = trimesh.load(folder.mesh)

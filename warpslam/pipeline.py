@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     import trimesh
 
     from warpslam.camera import Intrinsics
+    from warpslam.compilation import ModuleProgress
     from warpslam.config import Config
     from warpslam.plots import Panel
     from warpslam.sequences.base import Frame, RgbdSequence
@@ -87,6 +88,7 @@ def run(
     source: Source | None = None,
     truth_mesh: trimesh.Trimesh | None = None,
     on_frame: Callable[[Progress], None] | None = None,
+    on_module: Callable[[ModuleProgress], None] | None = None,
 ) -> RunResult:
     """Run SLAM over a sequence and write a run folder.
 
@@ -100,14 +102,16 @@ def run(
         source: How to open ``sequence`` again, for `warpslam render`.
         truth_mesh: True surface in the world frame of the sequence; adds the reconstruction metrics.
         on_frame: Called after each frame.
+        on_module: Called before and after each module of kernels is loaded, or compiled if it never was.
 
     Raises:
         WarpSlamError: The input or a setting can't be used. metrics.json is written even so.
     """
-    selected = _select(sequence, frames)
+    selected = select_frames(sequence, frames)
     folder = RunFolder.create(output, sequence.name)
     with _log_file(folder.log):
-        return _Run(sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame).execute()
+        run_ = _Run(sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame, on_module)
+        return run_.execute()
 
 
 class _Run:
@@ -122,9 +126,12 @@ class _Run:
         source: Source | None,
         truth_mesh: trimesh.Trimesh | None,
         on_frame: Callable[[Progress], None] | None,
+        on_module: Callable[[ModuleProgress], None] | None,
     ) -> None:
         self.sequence, self.config, self.folder, self.selected = sequence, config, folder, selected
         self.device, self.seed, self.source, self.truth_mesh, self.on_frame = device, seed, source, truth_mesh, on_frame
+        self.on_module = on_module
+        self.modules: list[ModuleProgress] = []
         self.slam: Slam | None = None
         self.status = "finished"
         self.frame_indices: list[int] = []
@@ -177,8 +184,10 @@ class _Run:
 
     def _build_slam(self) -> None:
         with self._clock("setup"):
+            with self._clock("kernel_compile"):
+                self.modules = load_kernels(self.sequence, self.device, self.on_module)
             self.slam = build_slam(self.sequence.intrinsics, self.config, self.device, self.seed)
-        self.seconds["kernel_compile"] = self.slam.compile_seconds
+        self.seconds["kernel_compile"] += self.slam.compile_seconds
 
     def _process_frames(self) -> None:
         assert self.slam is not None
@@ -342,6 +351,9 @@ class _Run:
                     for phase, times in phases.items()
                 },
                 "stages_seconds": dict(self.seconds),
+                "kernel_modules": {
+                    module.name: {"seconds": module.seconds, "compiled": module.compiled} for module in self.modules
+                },
                 "frames": [
                     {"index": index, **result.timings}
                     for index, result in zip(self.frame_indices, self.results, strict=False)
@@ -372,6 +384,7 @@ class _Run:
                 "run": self.seconds["total"] - self.seconds["kernel_compile"],
                 "frames": frame_seconds,
             },
+            "compiled_kernels": sorted(module.name for module in self.modules if module.compiled),
             "fps": len(self.results) / frame_seconds if frame_seconds > 0 else None,
             "peak_memory_mib": _peak_memory_mib(),
             **self.metrics,
@@ -387,6 +400,23 @@ class _Run:
             self.seconds[stage] += time.perf_counter() - start
 
 
+def load_kernels(
+    sequence: RgbdSequence, device: str | None, report: Callable[[ModuleProgress], None] | None = None
+) -> list[ModuleProgress]:
+    """Load all kernels that a run over ``sequence`` needs, compiling those that never were; see
+    `warpslam.compilation.compile_kernels`.
+
+    Raises:
+        ConfigError: There is no such device.
+    """
+    import warp as wp
+
+    from warpslam.compilation import compile_kernels
+
+    check_device(device)
+    return compile_kernels(wp.get_device(device), report, getattr(sequence, "warp_modules", ()))
+
+
 def build_slam(intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Slam:
     """The SLAM object of a run.
 
@@ -396,7 +426,7 @@ def build_slam(intrinsics: Intrinsics, config: Config, device: str | None, seed:
     """
     from warpslam.slam import Slam
 
-    _check_device(device)
+    check_device(device)
     return Slam(intrinsics, config=config, device=device, seed=seed)
 
 
@@ -411,11 +441,16 @@ def load_slam(folder: RunFolder, device: str | None = None) -> Slam:
     from warpslam.slam import Slam
 
     path = folder.require(folder.map, "the run stopped before it had a map")
-    _check_device(device)
+    check_device(device)
     return Slam.load(path, device=device)
 
 
-def _check_device(device: str | None) -> None:
+def check_device(device: str | None) -> None:
+    """Whether Warp has the device of that name; None is Warp's preferred one.
+
+    Raises:
+        ConfigError: It has not.
+    """
     import warp as wp
 
     names = [str(known) for known in wp.get_devices()]
@@ -525,7 +560,12 @@ def psnr(rendered: np.ndarray, rgb: np.ndarray) -> float:
     return float(-10 * np.log10(max(mean_square, 1e-12)))
 
 
-def _select(sequence: RgbdSequence, frames: slice | None) -> range:
+def select_frames(sequence: RgbdSequence, frames: slice | None) -> range:
+    """Numbers of the frames to use, all by default.
+
+    Raises:
+        ConfigError: The slice selects none, or goes backwards.
+    """
     frames = slice(None) if frames is None else frames
     if frames.step is not None and frames.step < 1:
         raise ConfigError(f"frames: step {frames.step} must be at least 1; SLAM goes forward in time")

@@ -11,13 +11,15 @@ import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics, check_transform, pose_from_vector, vector_from_pose
+from warpslam.compilation import compile_kernels
 from warpslam.config import Config
 from warpslam.decoders import Decoders, load_decoders
 from warpslam.errors import InputError
 from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth
-from warpslam.launching import compile_kernels, synchronize
+from warpslam.launching import synchronize
 from warpslam.mapper import Mapper
 from warpslam.meshing import ObservedView, extract_mesh
+from warpslam.profiling import phase
 from warpslam.rendering import RenderedImage, render_image
 from warpslam.scene import SceneMap
 from warpslam.tracker import Tracker, TrackingResult
@@ -85,7 +87,9 @@ class Slam:
         _check_image_size(intrinsics, self.config)
         self.device = wp.get_device(device)
         self.seed = seed
-        self.compile_seconds = compile_kernels(self.device)
+        start = time.perf_counter()
+        compile_kernels(self.device)
+        self.compile_seconds = time.perf_counter() - start
         self.scene = SceneMap(decoders or load_decoders(self.config.decoders), self.config.grid, self.device, seed)
         self.keyframes: list[Keyframe] = []
         self._images = ImagePool(intrinsics, self.device)
@@ -341,17 +345,20 @@ class Slam:
 
 
 class _timed:
-    """Adds the wall-clock seconds of a block to ``timings[name]``."""
+    """Adds the wall-clock seconds of a block to ``timings[name]``; the block is a phase for the profiler."""
 
     def __init__(self, timings: dict[str, float], name: str, device: wp.Device) -> None:
         self.timings, self.name, self.device = timings, name, device
+        self.phase = phase(name)
 
     def __enter__(self) -> None:
+        self.phase.__enter__()
         self.start = time.perf_counter()
 
     def __exit__(self, *_: object) -> None:
         synchronize(self.device)
         self.timings[self.name] = self.timings.get(self.name, 0.0) + time.perf_counter() - self.start
+        self.phase.__exit__()
 
 
 def _to_numpy(array: Any) -> np.ndarray:

@@ -7,11 +7,11 @@ import sys
 from collections.abc import Sequence
 
 from warpslam import __version__
-from warpslam.cli import evaluate, info, mesh, render, run
+from warpslam.cli import evaluate, info, mesh, profile, render, run, warmup
 from warpslam.cli.common import EXIT_ERROR, EXIT_INTERRUPTED
 from warpslam.errors import WarpSlamError
 
-COMMANDS = (run, evaluate, render, mesh, info)
+COMMANDS = (run, evaluate, render, mesh, profile, warmup, info)
 """Modules with a function ``add(commands)``, in the order of ``warpslam --help``."""
 
 

@@ -19,6 +19,7 @@ def _info(options: argparse.Namespace) -> int:
     from importlib.metadata import PackageNotFoundError, version
 
     from warpslam import __version__
+    from warpslam.complexity import field_flops, flops_per_point
     from warpslam.config import PRESETS
     from warpslam.decoders import DEFAULT_PATH, load_decoders
     from warpslam.sequences import DATASETS
@@ -32,6 +33,8 @@ def _info(options: argparse.Namespace) -> int:
     print(f"devices     {', '.join(_device_names())}")
     widths = {weights.level: weights.hidden for weights in load_decoders(options.decoders)}
     print(f"decoders    {options.decoders or DEFAULT_PATH}, hidden width {widths}")
+    flops = ", ".join(f"{level} {count:,}" for level, count in field_flops(widths).items())
+    print(f"FLOP/point  {flops} (middle + fine + colour); iMAP* {flops_per_point('imap'):,}")
     print(f"datasets    {', '.join(DATASETS)}")
     print(f"presets     {', '.join(PRESETS)}")
     return 0

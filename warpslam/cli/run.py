@@ -13,8 +13,8 @@ from warpslam.cli.common import (
     EXIT_INTERRUPTED,
     add_command,
     add_run_options,
+    add_sequence_options,
     duration,
-    parse_frames,
     print_reconstruction,
     quiet_warp,
     warnings_on_stderr,
@@ -23,6 +23,7 @@ from warpslam.cli.common import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from warpslam.compilation import ModuleProgress
     from warpslam.config import Config
     from warpslam.pipeline import Progress, RunResult
     from warpslam.run_folder import Source
@@ -35,10 +36,7 @@ def add(commands: Any) -> None:
     """Add both commands."""
     run = add_command(commands, "run", _run, "trajectory and coloured mesh of a folder of RGB-D frames")
     run.add_argument("folder", metavar="FOLDER", help="folder of one sequence")
-    run.add_argument("--dataset", default="auto", help="format of the folder (default: told from its file names)")
-    run.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
-    run.add_argument("--preset", help="settings to start from (default: the dataset's)")
-    run.add_argument("--frames", type=parse_frames, metavar="A:B:STEP", help="frames to use, as in a Python slice")
+    add_sequence_options(run)
     run.add_argument("--truth-mesh", metavar="FILE", help="true surface, for the reconstruction metrics")
     add_run_options(run)
 
@@ -78,7 +76,7 @@ def _execute(
 
     if options.decoders:
         config = config.model_copy(update={"decoders": options.decoders})
-    with warnings_on_stderr(), _progress(sequence.name) as on_frame:
+    with warnings_on_stderr(), _progress(sequence.name) as (on_frame, on_module):
         result = run(
             sequence,
             config,
@@ -87,6 +85,7 @@ def _execute(
             seed=options.seed,
             source=source,
             on_frame=on_frame,
+            on_module=on_module,
             **keywords,
         )
     _print_summary(result)
@@ -94,11 +93,13 @@ def _execute(
 
 
 @contextmanager
-def _progress(name: str) -> Iterator[Callable[[Progress], None]]:
-    """A progress bar on a terminal, about twenty lines anywhere else."""
+def _progress(name: str) -> Iterator[tuple[Callable[[Progress], None], Callable[[ModuleProgress], None]]]:
+    """What shows frames, and modules that are compiled: a progress bar on a terminal, about twenty lines anywhere
+    else.
+    """
     if not sys.stdout.isatty():
-        print(f"{name}: compiling kernels (once a machine), then mapping the first frame", flush=True)
-        yield _print_line
+        print(f"{name}: loading kernels, then mapping the first frame", flush=True)
+        yield _print_line, _print_module
         return
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
@@ -109,7 +110,7 @@ def _progress(name: str) -> Iterator[Callable[[Progress], None]]:
     )  # fmt: skip
     # rich redirects stdout and stderr while the bar is up, so warnings appear above it.
     with Bar(*columns) as bar:
-        task = bar.add_task(name, total=None, figures="compiling kernels (once), mapping the first frame")
+        task = bar.add_task(name, total=None, figures="loading kernels")
 
         def show(progress: Progress) -> None:
             if progress.done >= progress.total:
@@ -118,7 +119,22 @@ def _progress(name: str) -> Iterator[Callable[[Progress], None]]:
                 figures = _figures(progress)
             bar.update(task, total=progress.total, completed=progress.done, figures=figures)
 
-        yield show
+        def show_module(module: ModuleProgress) -> None:
+            figures = _compiling(module) if module.compiled else "loading kernels"
+            if module.done == module.total:
+                figures = "mapping the first frame"
+            bar.update(task, total=module.total, completed=module.done, figures=figures)
+
+        yield show, show_module
+
+
+def _print_module(module: ModuleProgress) -> None:
+    if module.compiled and module.seconds is None:
+        print(_compiling(module), flush=True)
+
+
+def _compiling(module: ModuleProgress) -> str:
+    return f"compiling {module.name} (once a machine), {module.done} of {module.total} modules ready"
 
 
 def _print_line(progress: Progress) -> None:

@@ -24,7 +24,10 @@ class RenderedSequence(RgbdSequence):
     """Views of a mesh along a path, rendered when they are asked for.
 
     noise_seed: None = exact depth, else frame i's depth carries `sensor_noise` that depends on (noise_seed, i) only.
+    warp_modules: Modules of kernels that rendering needs, beside those of SLAM.
     """
+
+    warp_modules = ("warpslam.synthetic.raycast",)
 
     def __init__(self, name: str, renderer: MeshRenderer, poses: np.ndarray, *, noise_seed: int | None = None) -> None:
         self.name = name
