@@ -283,14 +283,17 @@ def test_device_times_go_to_the_phase_they_belong_to(monkeypatch):
     with warpslam.profile() as profile:
         with phase("mapping"):
             profile._cuda.launched(kernel, False, 480, [])
-            pending.append(Timing(f"forward kernel {kernel.get_mangled_name()}", 2.0))
+            profile._cuda.launched(kernel, True, 480, [])
+            pending.append(Timing(f"backward kernel {kernel.key}_0123abcd", 4.0))
+            pending.append(Timing(f"forward kernel {kernel.key}_0123abcd", 2.0))
             with phase("color"):
                 pending.append(Timing("builtin kernel fill", 1.0))
     rows = {row.kernel: row for row in profile.report.kernels}
     assert rows["transpose_color_weights"].phase == "mapping" and rows["fill"].phase == "mapping / color"
     assert rows["transpose_color_weights"].seconds == pytest.approx(2e-3)
+    assert rows["transpose_color_weights (adjoint)"].seconds == pytest.approx(4e-3)
     assert rows["transpose_color_weights"].gigabytes == pytest.approx(480 * 256e-9)
-    assert {row.phase: row.elsewhere for row in profile.report.phases}["mapping"] == pytest.approx(2e-3)
+    assert {row.phase: row.elsewhere for row in profile.report.phases}["mapping"] == pytest.approx(6e-3)
 
 
 def test_command_line(monkeypatch, tmp_path, capsys):

@@ -30,7 +30,7 @@ import warp._src.context as warp_context
 from warpslam import launching
 from warpslam.errors import WarpSlamError
 from warpslam.profiling import phases
-from warpslam.profiling.costs import Arguments, Work, work_of
+from warpslam.profiling.costs import NOTHING, Arguments, Work, work_of
 from warpslam.profiling.phases import Span, clock
 
 if TYPE_CHECKING:
@@ -83,7 +83,8 @@ class Interval:
 class Profile:
     """What ran inside its ``with`` block; once the block is left, `table`, `to_json` and `write_trace` report it.
 
-    Only one profile can be active at a time, and it sees all threads.
+    Only one profile can be active at a time, and it sees all threads. Phases that other threads enter run beside those
+    of the one that profiles, so that walls may then add up to more than ``wall_seconds``.
 
     launches, intervals, spans: What was recorded.
     peak_gflops: Single-precision matrix product of NumPy on all cores, measured as the block is entered [GFLOP/s].
@@ -225,7 +226,9 @@ class Profile:
             self._charge(start, before)
             if self._cuda is not None and result is None and wp.get_device(kwargs.get("device")).is_cuda:
                 threads = math.prod(dim) if isinstance(dim, tuple | list) else int(dim)
-                values = [*kwargs.get("inputs", args[:1]), *kwargs.get("outputs", ())]
+                inputs = kwargs.get("inputs", args[0] if args else ())
+                outputs = kwargs.get("outputs", args[1] if len(args) > 1 else ())
+                values = [*inputs, *outputs]
                 self._cuda.launched(kernel, bool(kwargs.get("adjoint")), threads, values)
             return result
 
@@ -310,7 +313,7 @@ class _CudaTimer:
 
     def __init__(self, profile: Profile) -> None:
         self._profile = profile
-        self._pending: dict[str, deque[tuple[str, Work]]] = defaultdict(deque)
+        self._pending: dict[str, deque[Work]] = defaultdict(deque)
         profile.threads[GPU] = "GPU"
         self._begin()
 
@@ -321,7 +324,7 @@ class _CudaTimer:
     def launched(self, kernel: wp.Kernel, adjoint: bool, threads: int, values: list) -> None:
         """Note a launch, whose time comes later."""
         work = work_of(kernel, adjoint, threads, Arguments(kernel, values, readable=False))
-        self._pending[kernel.get_mangled_name()].append((_name(kernel, adjoint), work))
+        self._pending[_name(kernel, adjoint)].append(work)
 
     def collect(self) -> None:
         """Charge the current phase with all kernels since the last time."""
@@ -336,9 +339,12 @@ class _CudaTimer:
         path = self._profile._where()[0]
         start = self._since
         for result in wp.timing_end():
-            mangled = result.name.rpartition(" ")[2]
-            waiting = self._pending.get(mangled)
-            name, work = waiting.popleft() if waiting else (mangled, Work(counted=False))
+            # "forward kernel middle_forward_f40074b3", "backward kernel ...", "builtin kernel ...".
+            kind, _, mangled = result.name.rpartition(" ")
+            key = mangled.rpartition("_")[0]
+            name = f"{key} (adjoint)" if kind.startswith("backward") else key
+            waiting = self._pending.get(name)
+            name, work = (name, waiting.popleft()) if waiting else (mangled, NOTHING)
             stop = start + 1e-3 * result.elapsed
             self._profile.launches.append(Launch(name, path, GPU, False, start, stop, work))
             start = stop
