@@ -17,6 +17,7 @@ from warpslam import cli, demo, launching
 from warpslam.camera import Intrinsics
 from warpslam.errors import WarpSlamError
 from warpslam.field import Thresholds
+from warpslam.kernels.decoder import BLOCK_SIZE
 from warpslam.profiling import costs, phase, phases, recorder
 from warpslam.synthetic import SyntheticSequence
 
@@ -231,7 +232,9 @@ def test_counted_points_are_those_computed(frames, min_transmittance, monkeypatc
     total = batch.count * batch.sample_count
     for level in ("middle", "fine", "color"):
         written = (batch.bits[level].numpy()[:total] != 0xFFFFFFFF).any(axis=1).sum()
-        assert counted[f"{level}_forward"] == written
+        # Blocks with one heavy sample are computed, and leave out the light ones' colours.
+        block = BLOCK_SIZE["cuda" if slam.device.is_cuda else "cpu"] if level == "color" else 1
+        assert counted[f"{level}_forward"] <= written <= block * counted[f"{level}_forward"]
     assert 0 < counted["color_forward"] < counted["fine_forward"] <= total
     assert (counted["fine_forward"] < total) == (min_transmittance > 0)
 
@@ -263,12 +266,12 @@ def test_operations_of_the_adjoints():
 
 
 def test_what_cannot_be_counted_is_a_bound(frames):
-    """Arguments that lie on another device leave the number of threads, and say so."""
+    """Arrays that lie on another device leave the number of points of the launch, and say so."""
     slam = new_slam()
     names = [argument.label for argument in launching.decoders_for(slam.device).middle_forward.adj.args]
-    values = [dict(width=8, first_ray=0).get(name) for name in names]
+    values = [dict(point_count=800, width=8, first_ray=0).get(name) for name in names]
     kernel = launching.decoders_for(slam.device).middle_forward
-    work = costs.work_of(kernel, False, 800, costs.Arguments(kernel, values, readable=False))
+    work = costs.work_of(kernel, False, 200, costs.Arguments(kernel, values, readable=False))
     assert (work.points, work.counted) == (800, False)
 
 

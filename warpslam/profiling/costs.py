@@ -4,7 +4,8 @@ Operations are counted as `warpslam.complexity` counts them, two a weight and on
 sines, interpolation and compositing are left out, so that rates are a little too low rather than too high. An adjoint
 costs two operations a weight for the derivative by its inputs, and two for the derivative by the weights.
 
-Decoder kernels skip points: behind the surface, without weight, without gradient. On the CPU the points that are
+Decoder kernels skip points: behind the surface, without weight, without gradient. (On the CPU they compute blocks of
+four where one is wanted; the others are no useful work and do not count.) On the CPU the points that are
 computed are counted from the arrays the kernel is about to read; where that can't be done, all of them count and
 `Work.counted` says so.
 """
@@ -127,19 +128,20 @@ def _forward(level: str) -> Model:
     each = flops_per_point(level)
 
     def work(threads: int, arguments: Arguments) -> Work:
+        every = arguments.number("point_count")
         try:
-            points = _forward_points(threads, arguments, level == "color")
+            points = _forward_points(every, arguments, level == "color")
         except KeyError:
-            return Work(threads, each * threads, counted=False)
+            return Work(every, each * every, counted=False)
         return Work(points, each * points)
 
     return work
 
 
-def _forward_points(threads: int, arguments: Arguments, weighted: bool) -> int:
+def _forward_points(every: int, arguments: Arguments, weighted: bool) -> int:
     """Samples on rays that are not spent yet, and for colour those that weigh something."""
     first, width = arguments.number("first_ray"), arguments.number("width")
-    rays = threads // width
+    rays = every // width
     transmittance = arguments.floats("transmittance", first, first + rays)
     going = transmittance[:, 0] >= arguments.number("min_transmittance")
     if not weighted:
@@ -159,12 +161,13 @@ def _backward(gradient: str, components: int, level: str | None = None) -> Model
             points=bool(_optional(arguments, "want_point")),
             weights=bool(_optional(arguments, "want_weights")),
         )
+        every = arguments.number("point_count")
         try:
             start = arguments.number("start")
-            values = arguments.floats(gradient, start, start + threads, components)
+            values = arguments.floats(gradient, start, start + every, components)
             points = int(np.count_nonzero((np.abs(values) > _optional(arguments, "min_gradient")).any(axis=1)))
         except KeyError:
-            return Work(threads, each * threads, counted=False)
+            return Work(every, each * every, counted=False)
         return Work(points, each * points)
 
     return work
