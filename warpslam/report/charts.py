@@ -100,14 +100,14 @@ def time_chart(
     with np.errstate(divide="ignore", invalid="ignore"):
         for key, title, curve in curves:
             drawn.append(polyline(pixels, up(np.log10(curve) if logarithmic else curve), key, title))
-    drawn.append(element("line", x1=-9, x2=-9, y1=TOP, y2=HEIGHT - BOTTOM, class_="cursor"))
+    drawn.append(element("line", y1=TOP, y2=HEIGHT - BOTTOM, class_="cursor", visibility="hidden"))
     return svg(name, WIDTH, HEIGHT, drawn, "timeline")
 
 
 def stacked_bars(
     name: str, frames: Sequence[int], parts: Sequence[tuple[str, str, np.ndarray]], *, x_label: str, y_label: str
 ) -> Html:
-    """A bar of parts a frame; of many frames, the mean over neighbours.
+    """A bar of parts a frame; of many frames, the mean over neighbours. One bar far above all others is cut off.
 
     Args:
         name: What a screen reader says.
@@ -120,9 +120,13 @@ def stacked_bars(
     groups = np.array_split(np.arange(count), min(count, MAX_BARS))
     heights = np.array([[values[group].mean() for group in groups] for _, _, values in parts]).reshape(len(parts), -1)
     across = Scale(0, len(groups), LEFT, WIDTH - RIGHT)
-    up = Scale(0, 1.05 * float(heights.sum(axis=0).max()) or 1.0, HEIGHT - BOTTOM, TOP)
+    totals = heights.sum(axis=0)
+    top, second = float(totals.max()), float(np.sort(totals)[-2]) if len(totals) > 1 else 0.0
+    # The first frame takes many times as long as the rest, which it would flatten.
+    is_cut = 0 < 2.5 * second < top
+    up = Scale(0, 1.25 * second if is_cut else 1.05 * top or 1.0, HEIGHT - BOTTOM, TOP)
     numbers = Scale(frames[0] - 0.5, frames[-1] + 0.5, LEFT, WIDTH - RIGHT)
-    steps = ticks(0, up.high, 4)
+    steps = ticks(0, up.high, 5)
     drawn = [_frame(numbers, up, steps, [f"{step:g}" for step in steps], x_label, y_label)]
     width = max(float(across(1) - across(0)) - (1.0 if len(groups) < 120 else 0.0), 0.5)
     for n, group in enumerate(groups):
@@ -131,12 +135,16 @@ def stacked_bars(
         bars, base = [], 0.0
         for (key, title, _), height in zip(parts, heights[:, n], strict=True):
             if height > 0:
-                y = float(up(base + height))
+                lines.append(f"{title} {height:.3g} s")
+            if height > 0 and up(base) > TOP:
+                y = max(float(up(base + height)), TOP)
                 bar = {"x": float(across(n)), "width": width, "y": y, "height": float(up(base)) - y}
                 bars.append(element("rect", **bar, class_=f"fill {key}"))
-                lines.append(f"{title} {height:.3g} s")
             base += height
         drawn.append(element("g", element("title", "\n".join(lines)), bars))
+        if totals[n] > up.high:
+            beyond = {"x": float(across(n + 1)) + 4, "y": TOP + 9.0}
+            drawn.append(element("text", f"↑ {totals[n]:.3g} s", **beyond, class_="cut"))
     return svg(name, WIDTH, HEIGHT, drawn, "bars")
 
 
@@ -183,7 +191,7 @@ def ground_chart(
         at = {"cx": float(across(x)), "cy": float(up(y))}
         drawn.append(element("circle", element("title", text), **at, r=4, class_=f"point {key}"))
     if cursor:
-        drawn.append(element("circle", cx=-9, cy=-9, r=6, class_="cursor"))
+        drawn.append(element("circle", r=6, class_="cursor", visibility="hidden"))
     drawing = svg(name, WIDTH, TOP + height + BOTTOM, drawn, "ground" if cursor else "graph")
     last = lines[-1][2]
     return drawing, np.stack([across(last[:, 0]), up(last[:, 1])], axis=1) if cursor else None

@@ -79,16 +79,19 @@ def mesh_views(mesh: trimesh.Trimesh, poses: np.ndarray, limit: int | None = Non
     axes = upright_axes(poses)
     open_mesh, was_cut = _without_ceiling(mesh, poses, axes[2])
     cut = ", ceiling cut away" if was_cut else ""
-    center = open_mesh.bounds.mean(axis=0)
-    radius = float(np.linalg.norm(np.ptp(open_mesh.bounds, axis=0))) / 2
     # Narrow lens, far away: walls stay nearly upright in the view from above.
     narrow, wide = _camera(0.35), _camera(1.2)
-    # Corners of the box, level with its diagonal, from 35 degrees above.
-    corners = [_unit(-0.75 * axes[1] + side * 0.75 * axes[0] + 0.75 * axes[2]) for side in (-1, 1)]
-    above = _look(center, axes[2], axes[1], narrow, open_mesh.vertices)
+    # Over the cameras' shoulders, where walls do not hide what they looked at.
+    back = _mean_backward(poses, axes)
+    aside = np.cross(axes[2], back)
+    corners = [_unit(back + side * 0.8 * aside + 0.85 * axes[2]) for side in (-1, 1)]
+    shown = np.concatenate([open_mesh.vertices, poses[:, :3, 3]])
+    center = (shown.min(axis=0) + shown.max(axis=0)) / 2
+    radius = float(np.linalg.norm(np.ptp(shown, axis=0))) / 2
+    above = _look(center, axes[2], axes[1], narrow, shown)
     views = [(f"From above{cut}", open_mesh, narrow, above, True)]
     for direction, side in zip(corners, ("left", "right"), strict=True):
-        T = _look(center, direction, axes[2], narrow, open_mesh.vertices)
+        T = _look(center, direction, axes[2], narrow, shown)
         views.append((f"From the {side}{cut}", open_mesh, narrow, T, True))
     views.append(("From the camera, in mid-run", mesh, wide, poses[len(poses) // 2], False))
     pictures = []
@@ -97,6 +100,12 @@ def mesh_views(mesh: trimesh.Trimesh, poses: np.ndarray, limit: int | None = Non
         pixels = _project(poses[:, :3, 3], T, camera) / SUPERSAMPLING if outside else None
         pictures.append(MeshView(title, data_uri(_render(visible, camera, T, 4 * radius + 50)), pixels))
     return pictures
+
+
+def _mean_backward(poses: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Level direction against the cameras' mean view; the nearer side of the picture where they looked all around."""
+    back = axes[:2].T @ (axes[:2] @ -poses[:, :3, 2].mean(axis=0))
+    return _unit(back) if np.linalg.norm(back) > 0.2 else -axes[1]
 
 
 def _without_ceiling(mesh: trimesh.Trimesh, poses: np.ndarray, up: np.ndarray) -> tuple[trimesh.Trimesh, bool]:

@@ -13,10 +13,10 @@
     for (let i = 1; i < data.text.length; i++) if (measure(i) < measure(best)) best = i;
     return best;
   };
+  const cursors = document.querySelectorAll(".cursor");
   const hide = () => {
     readout.hidden = true;
-    for (const line of document.querySelectorAll("line.cursor")) { line.setAttribute("x1", -9); line.setAttribute("x2", -9); }
-    for (const dot of document.querySelectorAll("circle.cursor")) dot.setAttribute("cx", -9);
+    for (const cursor of cursors) cursor.setAttribute("visibility", "hidden");
   };
   const show = (event) => {
     const svg = event.currentTarget;
@@ -24,13 +24,12 @@
     const frame = svg.classList.contains("ground")
       ? nearest((i) => Math.hypot(data.path[i][0] - point.x, data.path[i][1] - point.y))
       : nearest((i) => Math.abs(data.time[i] - point.x));
-    for (const line of document.querySelectorAll("line.cursor")) {
-      line.setAttribute("x1", data.time[frame]);
-      line.setAttribute("x2", data.time[frame]);
-    }
-    for (const dot of document.querySelectorAll("circle.cursor")) {
-      dot.setAttribute("cx", data.path[frame][0]);
-      dot.setAttribute("cy", data.path[frame][1]);
+    for (const cursor of cursors) {
+      const places = cursor.tagName === "line"
+        ? { x1: data.time[frame], x2: data.time[frame] }
+        : { cx: data.path[frame][0], cy: data.path[frame][1] };
+      for (const [name, value] of Object.entries(places)) cursor.setAttribute(name, value);
+      cursor.setAttribute("visibility", "visible");
     }
     readout.textContent = data.text[frame];
     readout.hidden = false;

@@ -121,14 +121,14 @@ def trajectory_section(run: RunData) -> tuple[Html, np.ndarray | None]:
 def _error_table(run: RunData) -> Html:
     rows = []
     for title, path, scale, unit in (
-        ("ATE aligned", ("ate_m", "aligned"), 100, "cm"),
-        ("ATE unaligned", ("ate_m", "unaligned"), 100, "cm"),
-        ("RPE translation", ("rpe", "translation_m"), 100, "cm"),
+        ("ATE aligned", ("ate_m", "aligned"), 100, " cm"),
+        ("ATE unaligned", ("ate_m", "unaligned"), 100, " cm"),
+        ("RPE translation", ("rpe", "translation_m"), 100, " cm"),
         ("RPE rotation", ("rpe", "rotation_deg"), 1, "°"),
     ):
         values = run.figure(*path)
         if values:
-            rows.append([title, *(f"{scale * values[key]:.3f} {unit}" for key in ("rmse", "mean", "median", "max"))])
+            rows.append([title, *(f"{scale * values[key]:.3f}{unit}" for key in ("rmse", "mean", "median", "max"))])
     return table(("", "RMSE", "mean", "median", "largest"), rows, "numbers") if rows else missing(NO_TRUTH)
 
 
@@ -332,7 +332,7 @@ def timing_section(run: RunData) -> Html:
     rows = []
     for name, seconds in shares:
         phase = phases.get(name, {})
-        each = f"{1000 * phase['mean_seconds']:.0f} ms" if "mean_seconds" in phase else ""
+        each = duration(phase.get("mean_seconds")) or ""
         calls = str(phase.get("calls", ""))
         label = element("span", element("i", class_=f"swatch {keys[name]}"), name)
         rows.append([label, duration(seconds) or "", percent(seconds / total), calls, each])
