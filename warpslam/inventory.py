@@ -40,7 +40,7 @@ def take_inventory(slam: Slam) -> dict[str, Any]:
 
 
 def observed_volume(slam: Slam) -> float:
-    """Volume [m^3] of the cells, 0.16 m wide, that the depth rays of mapped frames crossed on their way to a surface."""
+    """Volume [m^3] of the 0.16 m cells that the depth rays of mapped frames crossed on their way to a surface."""
     camera = slam.intrinsics.strided(SEEN_STRIDE)
     cells: set[int] = set()
     for seen in slam._seen:

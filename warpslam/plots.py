@@ -63,7 +63,7 @@ def load_panels(path: Path) -> list[Panel]:
         with np.load(path, allow_pickle=False) as file:
             columns = [file[name] for name in ("index", "rgb", "depth", "rendered_rgb", "rendered_depth")]
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise DatasetError(f"{path}: can't be read as images of panels ({error}); run again to write it anew") from error
+        raise DatasetError(f"{path}: can't be read as images of panels ({error}); run again") from error
     return [
         Panel(int(index), rgb, depth / np.float32(1000), rendered_rgb / np.float32(255), far / np.float32(1000))
         for index, rgb, depth, rendered_rgb, far in zip(*columns, strict=True)

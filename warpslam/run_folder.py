@@ -133,7 +133,7 @@ class RunFolder:
         try:
             return Source(**fields)
         except TypeError as error:
-            raise DatasetError(f"{self.source}: expected the fields path, dataset, camera and command ({error})") from error
+            raise DatasetError(f"{self.source}: expected path, dataset, camera and command ({error})") from error
 
 
 def write_json(path: Path, value: Any) -> None:

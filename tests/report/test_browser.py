@@ -27,7 +27,7 @@ def browser() -> str:
     """Path of a Chromium, from WARPSLAM_CHROMIUM or the search path."""
     found = os.environ.get("WARPSLAM_CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
     if found is None:
-        pytest.skip("no Chromium found: install one, or set WARPSLAM_CHROMIUM to its path, to test reports in a browser")
+        pytest.skip("no Chromium found: install one, or set WARPSLAM_CHROMIUM to its path")
     return found
 
 

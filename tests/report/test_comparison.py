@@ -16,7 +16,7 @@ from warpslam.run_folder import read_json, write_json
 
 
 def test_comparison_of_runs(make_run, tmp_path):
-    """A row, bars and a picture a run; the best of each figure stands out, missing ones are a dash; links are relative."""
+    """A row, bars and a picture a run; the best of each figure stands out, missing ones are a dash."""
     good, bad, blind = (
         make_run("good"), make_run("bad", mesh_fails=True),
         make_run("blind", sequence=FakeSequence(6, no_truth=tuple(range(6)))),

@@ -16,7 +16,8 @@ from warpslam.report.sections import stage_seconds
 from warpslam.run_folder import RunFolder, read_json, write_json
 
 SECTIONS = (
-    "figures", "trajectory", "error", "images", "mesh", "keyframes", "timing", "memory", "frames", "settings", "versions",
+    "figures", "trajectory", "error", "images", "mesh", "keyframes", "timing", "memory", "frames", "settings",
+    "versions",
 )  # fmt: skip
 
 

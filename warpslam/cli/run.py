@@ -53,7 +53,8 @@ def _run(options: argparse.Namespace) -> int:
     from warpslam.run_folder import Source
 
     quiet_warp()
-    source = Source(str(Path(options.folder).expanduser().resolve()), options.dataset, options.camera, options.command_line)
+    path = str(Path(options.folder).expanduser().resolve())
+    source = Source(path, options.dataset, options.camera, options.command_line)
     sequence = open_source(source)
     config = Config.from_preset(options.preset or sequence.preset, options.overrides)
     truth_mesh = load_mesh(options.truth_mesh) if options.truth_mesh else None

@@ -13,6 +13,7 @@ WIDTH, HEIGHT = 720, 240
 LEFT, RIGHT, TOP, BOTTOM = 52, 12, 12, 34
 MAX_POINTS = 1500
 MAX_BARS = 180
+MAX_DECADES = 6
 
 
 @dataclass(frozen=True)
@@ -78,9 +79,10 @@ def time_chart(
     """
     values = np.concatenate([curve for _, _, curve in curves]) if curves else np.zeros(1)
     values = values[np.isfinite(values) & ((values > 0) | (not logarithmic))]
-    low, high = (values.min(), values.max()) if len(values) else (0.0, 1.0)
+    low, high = (values.min(), values.max()) if len(values) else (0.1, 1.0)
     if logarithmic:
         low, high = np.floor(np.log10(low)), np.ceil(np.log10(high) + 1e-9)
+        low = max(low, high - MAX_DECADES)
     else:
         low, high = 0.0, (top if top is not None else 1.06 * max(high, level[0] if level else 0) or 1.0)
     across = Scale(float(x[0]), float(x[-1]), LEFT, WIDTH - RIGHT)
@@ -237,9 +239,7 @@ def _frame(
         drawn.append(element("text", f"{step:g}", x=x, y=bottom + 16, class_="tick x"))
     drawn.append(element("text", x_label, x=right, y=bottom + 31, class_="label x"))
     middle = (TOP + bottom) / 2
-    drawn.append(
-        element("text", y_label, x=13, y=middle, class_="label y", transform=f"rotate(-90 13 {middle:.1f})")
-    )
+    drawn.append(element("text", y_label, x=13, y=middle, class_="label y", transform=f"rotate(-90 13 {middle:.1f})"))
     return element("g", drawn, class_="axes")
 
 

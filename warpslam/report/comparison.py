@@ -84,16 +84,24 @@ def table_section(runs: Sequence[RunData], names: Sequence[str], base: Path) -> 
     """All figures; the best of each in bold."""
     shown = [figure for figure in FIGURES if any(run.figure(*figure.path) is not None for run in runs)]
     best = {figure: _best(figure, runs) for figure in shown}
+    facts: list[tuple[str, Callable[[RunData], str]]] = [
+        ("status", lambda run: str(run.figure("status") or "unknown")),
+        ("tracked", _frames),
+    ]
+    if len({run.name for run in runs}) > 1:
+        facts.insert(0, ("sequence", lambda run: run.name))
+    if any(run.figure("method") for run in runs):
+        facts.insert(0, ("method", lambda run: str(run.figure("method") or "–")))
     rows = []
     for run, name in zip(runs, names, strict=True):
-        cells: list[str] = [_link(run, name, base), run.name, str(run.figure("status") or "unknown")]
-        cells.append(_frames(run))
+        cells: list[str] = [_link(run, name, base)]
+        cells += [text(run) for _, text in facts]
         for figure in shown:
             value = run.figure(*figure.path)
             text = "–" if value is None else figure.text(value) or "–"
             cells.append(element("strong", text) if value is not None and value == best[figure] else text)
         rows.append(cells)
-    head = ["run", "sequence", "status", "tracked", *(figure.title for figure in shown)]
+    head = ["run", *(title for title, _ in facts), *(figure.title for figure in shown)]
     absent = [figure.title for figure in FIGURES if figure not in shown]
     note = missing(f"No run has: {', '.join(absent)}.") if absent else None
     return section("table", "Figures", table(head, rows, "numbers"), note)
@@ -163,7 +171,9 @@ def runs_section(runs: Sequence[RunData], names: Sequence[str]) -> Html:
 
 
 def _best(figure: Figure, runs: Sequence[RunData]) -> float | None:
-    values = [value for run in runs if (value := run.figure(*figure.path)) is not None]
+    # What a run that broke off saved in time or memory is no merit.
+    finished = [run for run in runs if run.figure("status") == "finished"]
+    values = [value for run in finished if (value := run.figure(*figure.path)) is not None]
     if len(values) < 2:
         return None
     return min(values) if figure.lower_is_better else max(values)

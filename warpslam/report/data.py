@@ -139,7 +139,7 @@ def upright_axes(poses: np.ndarray) -> np.ndarray:
 
 
 def axis_name(direction: np.ndarray) -> str:
-    """"x", "-z", ... of a unit vector along a world axis."""
+    """Name of a unit vector along a world axis, such as x or −z."""
     axis = int(np.argmax(np.abs(direction)))
     return ("−" if direction[axis] < 0 else "") + "xyz"[axis]
 
@@ -163,4 +163,4 @@ def _read_frames(folder: RunFolder) -> tuple[list[FrameRecord], list[dict[str, A
     try:
         return [FrameRecord(**frame) for frame in content["frames"]], list(content["left_out"])
     except (KeyError, TypeError) as error:
-        raise DatasetError(f"{folder.frames}: field {error} is missing or unknown; run again to write it anew") from error
+        raise DatasetError(f"{folder.frames}: field {error} is missing or unknown; run again") from error

@@ -139,15 +139,17 @@ def _camera(angle: float) -> Intrinsics:
 
 
 def _look(center: np.ndarray, back: np.ndarray, up: np.ndarray, camera: Intrinsics, points: np.ndarray) -> np.ndarray:
-    """Pose of a camera that looks along ``-back`` at ``center`` from where all points (N, 3) just fit the picture."""
+    """Pose of a camera that looks along ``-back``, about at ``center``, from where all points (N, 3) just fit in."""
     T = np.eye(4)
     T[:3, 2] = -back
     T[:3, 0] = _unit(np.cross(T[:3, 2], up))
     T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
     local = (points - center) @ T[:3, :3]
+    middle = (local[:, :2].min(axis=0) + local[:, :2].max(axis=0)) / 2
+    local[:, :2] -= middle
     slope = np.array([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy]) * 0.96
     distance = float((np.abs(local[:, :2]) / slope - local[:, 2:]).max())
-    T[:3, 3] = center + back * max(distance, 0.1)
+    T[:3, 3] = center + T[:3, :2] @ middle + back * max(distance, 0.1)
     return T
 
 

@@ -48,6 +48,7 @@ def run_header(run: RunData) -> Html:
     frames = run.figure("frames", "processed")
     facts = [
         f"{frames} of {run.figure('frames', 'selected')} frames" if frames is not None else None,
+        str(run.figure("method")) if run.figure("method") else None,
         f"on {run.figure('device')}" if run.figure("device") else None,
         f"seed {run.figure('seed')}" if run.figure("seed") is not None else None,
         f"started {run.figure('started')}".replace("T", " ") if run.figure("started") else None,
@@ -182,9 +183,7 @@ def _tracking_charts(run: RunData, x: np.ndarray, marks: list[tuple[int, str, st
         "Inliers over time", x, [("estimate", "inliers", inliers)],
         x_label="time [s]", y_label="inliers [%]", marks=marks, top=105.0,
     )  # fmt: skip
-    content.append(
-        element("figure", chart, element("figcaption", "Share of the depth rays that agree with the map."))
-    )
+    content.append(element("figure", chart, element("figcaption", "Share of the depth rays that agree with the map.")))
     return element("div", content, class_="pair")
 
 
@@ -217,9 +216,8 @@ def images_section(run: RunData) -> Html:
             for title, image in pictures
         ]  # fmt: skip
         depth_error = centimetres(depth_l1(panel.rendered_depth, panel.depth)) if known.any() else "unknown"
-        heading = element(
-            "h3", f"Frame {panel.index}", element("small", f"PSNR {psnr(panel.rendered_rgb, panel.rgb):.1f} dB · depth L1 {depth_error}")
-        )
+        likeness = decibels(psnr(panel.rendered_rgb, panel.rgb))
+        heading = element("h3", f"Frame {panel.index}", element("small", f"PSNR {likeness} · depth L1 {depth_error}"))
         blocks.append(element("div", heading, element("div", cells, class_="six"), class_="panel"))
     scales = element(
         "div",

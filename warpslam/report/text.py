@@ -32,7 +32,8 @@ def megabytes(count: float | None) -> str | None:
     """Bytes in a unit that fits."""
     if count is None:
         return None
-    return f"{count / 1e9:.2f} GB" if count >= 1e9 else f"{count / 1e6:.2f} MB" if count >= 1e5 else f"{count / 1e3:.1f} kB"
+    size, unit = next(((size, unit) for size, unit in ((1e9, "GB"), (1e6, "MB")) if count >= 0.1 * size), (1e3, "kB"))
+    return f"{count / size:.2f} {unit}"
 
 
 def duration(seconds: float | None) -> str | None:
