@@ -68,18 +68,17 @@ def keyframe_overlaps(slam: Slam) -> tuple[list[int], list[tuple[int, int, float
     keyframes = slam.keyframes
     chosen = np.unique(np.linspace(0, len(keyframes) - 1, min(len(keyframes), MAX_KEYFRAMES)).round().astype(int))
     poses = [pose_from_vector(keyframes[n].pose) for n in chosen]
-    seen = {view.index: view for view in slam._seen}
+    if not slam._seen or not keyframes:
+        return [keyframe.index for keyframe in keyframes], []
     camera = slam.intrinsics
     rng = np.random.default_rng(0)
-    shares = np.full((len(chosen), len(chosen)), np.nan)
+    shares = np.zeros((len(chosen), len(chosen)))
     for row, n in enumerate(chosen):
-        # A keyframe that was not mapped left no depth here; its pairs are judged from the other side.
-        if keyframes[n].index in seen:
-            depth = seen[keyframes[n].index].depth().repeat(SEEN_STRIDE, axis=0).repeat(SEEN_STRIDE, axis=1)
-            shares[row] = overlap_fractions(depth[: camera.height, : camera.width], poses[row], poses, camera, rng)
-    known = np.isfinite(shares)
-    total = np.where(known, shares, 0.0) + np.where(known, shares, 0.0).T
-    mean = total / np.maximum(known.astype(int) + known.T, 1)
+        # Not every keyframe was mapped; the mapped frame nearest in time stands for what it saw.
+        seen = min(slam._seen, key=lambda view: abs(view.index - keyframes[n].index))
+        depth = seen.depth().repeat(SEEN_STRIDE, axis=0).repeat(SEEN_STRIDE, axis=1)[: camera.height, : camera.width]
+        shares[row] = overlap_fractions(depth, pose_from_vector(slam._vectors[seen.index]), poses, camera, rng)
+    mean = (shares + shares.T) / 2
     pairs = np.argwhere(np.triu(mean >= MIN_OVERLAP, k=1))
     overlaps = [(int(chosen[a]), int(chosen[b]), round(float(mean[a, b]), 3)) for a, b in pairs]
     return [keyframe.index for keyframe in keyframes], overlaps

@@ -29,6 +29,14 @@ def test_lines_break_where_nothing_is_known():
     assert 'd=""' in charts.polyline(x, np.full(5, np.nan), "c0")
 
 
+def test_what_only_some_frames_have_is_joined():
+    """A loss of every fifth frame is one line, not a row of points that no one sees."""
+    y = np.where(np.arange(20) % 5 == 0, 1.0 + np.arange(20), np.nan)
+    for bridge, strokes in ((True, 3), (False, 0)):
+        chart = charts.time_chart("t", np.arange(20.0), [("c0", "a", y)], x_label="x", y_label="y", bridge=bridge)
+        assert re.search(r'd="([^"]*)"', chart)[1].count("L") == strokes
+
+
 def test_long_lines_are_thinned_and_keep_their_peaks():
     """Of 20000 points few are drawn, the single peak among them."""
     y = np.zeros(20_000)

@@ -62,6 +62,7 @@ def time_chart(
     marks: Sequence[tuple[int, str, str]] = (),
     level: tuple[float, str] | None = None,
     logarithmic: bool = False,
+    bridge: bool = False,
     top: float | None = None,
 ) -> Html:
     """Curves over time or frames, with the cursor that all charts of a page share.
@@ -75,6 +76,7 @@ def time_chart(
         marks: (frame, CSS class, what to say) of frames that stand out.
         level: A value to draw a dashed line at, and its name.
         logarithmic: Scale of the values.
+        bridge: Draw on where a frame has no value, for what only some frames have.
         top: Upper end of the scale; the largest value by default.
     """
     values = np.concatenate([curve for _, _, curve in curves]) if curves else np.zeros(1)
@@ -97,11 +99,16 @@ def time_chart(
     if level is not None and not logarithmic:
         y = float(up(level[0]))
         drawn.append(element("line", x1=LEFT, x2=WIDTH - RIGHT, y1=y, y2=y, class_="level"))
-        drawn.append(element("text", level[1], x=WIDTH - RIGHT - 4, y=y - 5, class_="level-name"))
     pixels = across(x)
     with np.errstate(divide="ignore", invalid="ignore"):
         for key, title, curve in curves:
-            drawn.append(polyline(pixels, up(np.log10(curve) if logarithmic else curve), key, title))
+            y = up(np.log10(curve) if logarithmic else curve)
+            shown = np.isfinite(y) if bridge else slice(None)
+            drawn.append(polyline(pixels[shown], y[shown], key, title))
+    if level is not None and not logarithmic:
+        # After the curves, for its outline to part them.
+        at = {"x": WIDTH - RIGHT - 4, "y": float(up(level[0])) - 5}
+        drawn.append(element("text", level[1], **at, class_="level-name"))
     drawn.append(element("line", y1=TOP, y2=HEIGHT - BOTTOM, class_="cursor", visibility="hidden"))
     return svg(name, WIDTH, HEIGHT, drawn, "timeline")
 

@@ -174,7 +174,14 @@ def _tracking_charts(run: RunData, x: np.ndarray, marks: list[tuple[int, str, st
     content = []
     if losses:
         chart = charts.time_chart(
-            "Losses over time", x, losses, x_label="time [s]", y_label="loss", marks=marks, logarithmic=True
+            "Losses over time",
+            x,
+            losses,
+            x_label="time [s]",
+            y_label="loss",
+            marks=marks,
+            logarithmic=True,
+            bridge=True,
         )
         entries = legend(*((key, name) for key, name, _ in losses))
         content.append(element("figure", chart, entries, element("figcaption", "Mean loss per ray, by stage.")))
@@ -311,7 +318,7 @@ def keyframes_section(run: RunData) -> Html:
         axis_names=(axis_name(axes[0]), axis_name(axes[1])), points=points, links=links,
     )  # fmt: skip
     caption = (
-        f"{len(frames)} keyframes; {len(pairs)} pairs see at least {percent(SHOWN_OVERLAP)} of the same space. "
+        f"{len(frames)} keyframes; {len(pairs)} pairs see at least {100 * SHOWN_OVERLAP:.0f} % of the same space. "
         "The stronger a line, the more they share."
     )
     return section("keyframes", title, element("figure", chart, element("figcaption", caption)))
