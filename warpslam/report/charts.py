@@ -102,9 +102,9 @@ def time_chart(
     pixels = across(x)
     with np.errstate(divide="ignore", invalid="ignore"):
         for key, title, curve in curves:
-            y = up(np.log10(curve) if logarithmic else curve)
-            shown = np.isfinite(y) if bridge else slice(None)
-            drawn.append(polyline(pixels[shown], y[shown], key, title))
+            height = up(np.log10(curve) if logarithmic else curve)
+            shown = np.isfinite(height) if bridge else slice(None)
+            drawn.append(polyline(pixels[shown], height[shown], key, title))
     if level is not None and not logarithmic:
         # After the curves, for its outline to part them.
         at = {"x": WIDTH - RIGHT - 4, "y": float(up(level[0])) - 5}
