@@ -389,6 +389,11 @@ class _Run:
         except WarpSlamError as error:
             # The run is done and its figures are written; what stands in the way is in the log and on the terminal.
             log.error("no report: %s", error)
+        except Exception:
+            # Must not take the place of the error that ended the run.
+            if self.status != "failed":
+                raise
+            log.exception("no report")
 
     def _write_metrics(self) -> None:
         from warpslam import __version__

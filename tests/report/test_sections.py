@@ -159,6 +159,20 @@ def test_a_report_that_fails_does_not_fail_the_run(make_run, monkeypatch):
     assert "no report: the disk is full" in folder.log.read_text()
 
 
+def test_a_report_that_breaks_does_not_hide_why_the_run_failed(make_run, monkeypatch):
+    """After a failure the run's own error comes through; after a good run a defect of the report does."""
+
+    def break_(folder):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("warpslam.report.write_report", break_)
+    folder = make_run(fail_at=2)
+    assert read_json(folder.metrics)["error"] == "RuntimeError: out of memory"
+    assert "ZeroDivisionError" in folder.log.read_text()
+    with pytest.raises(ZeroDivisionError):
+        make_run("good")
+
+
 def test_stages_make_up_the_total(make_run):
     """Containers such as frames and setup are not counted twice."""
     folder = make_run()
