@@ -422,7 +422,7 @@ class _Run:
             "fps": len(self.results) / frame_seconds if frame_seconds > 0 else None,
             "peak_memory_mib": _peak_memory_mib(),
             "started": self.started.isoformat(timespec="seconds"),
-            "versions": package_versions(),
+            "versions": {"warpslam": __version__, "python": platform.python_version(), **package_versions()},
             "platform": platform.platform(),
             "processors": os.cpu_count(),
             **self.metrics,

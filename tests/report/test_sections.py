@@ -11,8 +11,8 @@ from tests.fakes import FakeSequence
 from tests.report.html_checks import Page
 from warpslam.errors import ConfigError, DatasetError, MeshError
 from warpslam.report import write_report
+from warpslam.report.accounts import stage_seconds
 from warpslam.report.data import RunData, axis_name, upright_axes
-from warpslam.report.sections import stage_seconds
 from warpslam.run_folder import RunFolder, read_json, write_json
 
 SECTIONS = (

@@ -17,14 +17,14 @@ def add(commands: Any) -> None:
 def _info(options: argparse.Namespace) -> int:
     import platform
 
+    from warpslam import __version__
     from warpslam.config import PRESETS
     from warpslam.decoders import DEFAULT_PATH, load_decoders
     from warpslam.sequences import DATASETS
     from warpslam.versions import package_versions
 
-    versions = package_versions()
-    print(f"warpslam    {versions.pop('warpslam')}, Python {versions.pop('python')}, {platform.platform()}")
-    for package, version in versions.items():
+    print(f"warpslam    {__version__}, Python {platform.python_version()}, {platform.platform()}")
+    for package, version in package_versions().items():
         print(f"{package:11} {version or 'not installed'}")
     print(f"devices     {', '.join(_device_names())}")
     widths = {weights.level: weights.hidden for weights in load_decoders(options.decoders)}
