@@ -76,7 +76,7 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
     assert timing["stages_seconds"]["finish_refinement"] == 0.5
     assert timing["phases"]["mapping"] == {"seconds": 4.0, "calls": 8, "mean_seconds": 0.5}
     assert timing["frames"][2] == {"index": 2, "tracking": 0.25, "mapping": 0.5}
-    frames = read_json(folder.frames)
+    frames = read_json(folder.frame_records)
     assert frames["left_out"] == [] and frames["frames"][2] == {
         "index": 2, "timestamp": 2 / 30, "status": "OK", "message": "", "inliers": 0.9, "losses": {"loss": 1.5},
     }  # fmt: skip
@@ -100,7 +100,7 @@ def test_unreadable_frames_are_left_out_and_counted(fake_slam, tmp_path):
     result = pipeline.run(FakeSequence(8, unreadable=(0, 3, 7)), Config(), tmp_path)
     assert result.metrics["frames"]["unreadable"] == 3 and result.metrics["frames"]["processed"] == 5
     assert "frame 3 left out: frame000003.jpg is truncated" in result.folder.log.read_text()
-    left_out = read_json(result.folder.frames)["left_out"]
+    left_out = read_json(result.folder.frame_records)["left_out"]
     assert left_out[1] == {"index": 3, "message": "frame000003.jpg is truncated"}
     np.testing.assert_array_equal(read_tum(result.folder.trajectory)[0], np.array([1, 2, 4, 5, 6]) / 30)
 

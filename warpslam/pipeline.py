@@ -379,7 +379,7 @@ class _Run:
             }
             for index, result in zip(self.frame_indices, self.results, strict=False)
         ]
-        write_json(self.folder.frames, {"frames": frames, "left_out": self.left_out})
+        write_json(self.folder.frame_records, {"frames": frames, "left_out": self.left_out})
 
     def _write_report(self) -> None:
         from warpslam.report import write_report

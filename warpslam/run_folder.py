@@ -53,7 +53,7 @@ class RunFolder:
     """Paths of one run.
 
     ``config`` effective settings, ``trajectory`` and ``ground_truth`` in TUM format, ``mesh``, ``map`` for later
-    rendering, ``metrics``, ``timing``, ``frames`` (what became of each), ``source`` (how to open the input again),
+    rendering, ``metrics``, ``timing``, ``frame_records`` (what became of each frame), ``source`` (how to open the input again),
     ``log``, ``report``, the plots, and the images of the panels as arrays.
     """
 
@@ -66,7 +66,7 @@ class RunFolder:
         self.map = self.path / "map.npz"
         self.metrics = self.path / "metrics.json"
         self.timing = self.path / "timing.json"
-        self.frames = self.path / "frames.json"
+        self.frame_records = self.path / "frames.json"
         self.source = self.path / "input.json"
         self.log = self.path / "log.txt"
         self.top_view = self.path / "trajectory_top_view.png"

@@ -101,7 +101,7 @@ def test_run_without_a_single_frame(make_run):
 def test_run_of_an_earlier_version(make_run):
     """A folder without the newer files makes a report that says what was not recorded."""
     folder = make_run()
-    for path in (folder.frames, folder.panel_images, folder.config, folder.timing, folder.source):
+    for path in (folder.frame_records, folder.panel_images, folder.config, folder.timing, folder.source):
         path.unlink()
     metrics = read_json(folder.metrics)
     write_json(folder.metrics, {name: metrics[name] for name in ("sequence", "status", "frames", "ate_m", "mesh")})
@@ -116,10 +116,10 @@ def test_names_from_outside_are_escaped(make_run):
     sequence = FakeSequence(8)
     sequence.name = evil
     folder = make_run(sequence=sequence, lost_at=3)
-    frames = read_json(folder.frames)
+    frames = read_json(folder.frame_records)
     frames["frames"][3].update(message=evil, status=evil)
     frames["left_out"] = [{"index": 9, "message": evil}]
-    write_json(folder.frames, frames)
+    write_json(folder.frame_records, frames)
     folder.write_source(type(folder.read_source())(evil, command=evil))
     folder.config.write_text(evil)
     page = report_of(folder)
@@ -134,7 +134,7 @@ def test_damaged_files_are_named(make_run):
     before = folder.report.read_bytes()
     for path, content, error in (
         (folder.panel_images, b"no zip", DatasetError),
-        (folder.frames, b'{"frames": [{"index": 0}]}', DatasetError),
+        (folder.frame_records, b'{"frames": [{"index": 0}]}', DatasetError),
         (folder.mesh, b"ply\n", MeshError),
     ):
         kept = path.read_bytes()

@@ -118,7 +118,7 @@ def frames_section(run: RunData) -> Html:
     if rows:
         content.append(table(("frame", "status", "why"), rows[:MAX_LISTED], "reasons"))
         if len(rows) > MAX_LISTED:
-            rest = f"{len(rows) - MAX_LISTED} more are in {run.folder.frames.name}."
+            rest = f"{len(rows) - MAX_LISTED} more are in {run.folder.frame_records.name}."
             content.append(element("p", rest, class_="missing"))
     elif not run.frames:
         content.append(missing("The run did not record why frames were lost or skipped."))

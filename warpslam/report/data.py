@@ -75,7 +75,9 @@ class RunData:
             timestamps, poses = read_tum(folder.trajectory)
         frames, left_out = _read_frames(folder)
         if frames and len(frames) != len(poses):
-            raise DatasetError(f"{folder.frames} has {len(frames)} frames and the trajectory {len(poses)}; run again")
+            raise DatasetError(
+                f"{folder.frame_records} has {len(frames)} frames and the trajectory {len(poses)}; run again"
+            )
         return cls(
             folder,
             read_json(folder.metrics),
@@ -157,10 +159,10 @@ def _read_truth(folder: RunFolder, timestamps: np.ndarray) -> np.ndarray | None:
 
 
 def _read_frames(folder: RunFolder) -> tuple[list[FrameRecord], list[dict[str, Any]]]:
-    if not folder.frames.is_file():
+    if not folder.frame_records.is_file():
         return [], []
-    content = read_json(folder.frames)
+    content = read_json(folder.frame_records)
     try:
         return [FrameRecord(**frame) for frame in content["frames"]], list(content["left_out"])
     except (KeyError, TypeError) as error:
-        raise DatasetError(f"{folder.frames}: field {error} is missing or unknown; run again") from error
+        raise DatasetError(f"{folder.frame_records}: field {error} is missing or unknown; run again") from error
