@@ -53,8 +53,8 @@ class RunFolder:
     """Paths of one run.
 
     ``config`` effective settings, ``trajectory`` and ``ground_truth`` in TUM format, ``mesh``, ``map`` for later
-    rendering, ``metrics``, ``timing``, ``frame_records`` (what became of each frame), ``source`` (how to open the input again),
-    ``log``, ``report``, the plots, and the images of the panels as arrays.
+    rendering, ``metrics``, ``timing``, ``frame_records`` (what became of each frame), ``source`` (how to
+    open the input again), ``log``, ``report``, the plots, and the images of the panels as arrays.
     """
 
     def __init__(self, path: str | Path) -> None:

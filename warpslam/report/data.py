@@ -75,9 +75,7 @@ class RunData:
             timestamps, poses = read_tum(folder.trajectory)
         frames, left_out = _read_frames(folder)
         if frames and len(frames) != len(poses):
-            raise DatasetError(
-                f"{folder.frame_records} has {len(frames)} frames and the trajectory {len(poses)}; run again"
-            )
+            raise DatasetError(f"{folder.frame_records} has {len(frames)} frames and the trajectory {len(poses)}")
         return cls(
             folder,
             read_json(folder.metrics),
