@@ -14,7 +14,7 @@ from warpslam.run_folder import read_json
 
 @pytest.fixture
 def faked(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
-    """Sequences and SLAM that answer at once, behind the real command line; plots are left out."""
+    """Sequences and SLAM that answer at once, behind the real command line; plots and reports are left out."""
 
     class Slam(FakeSlam):
         configs: list = []
@@ -25,6 +25,7 @@ def faked(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
 
     monkeypatch.setattr(pipeline, "build_slam", build)
     monkeypatch.setattr(pipeline._Run, "_draw_plots", lambda self: None)
+    monkeypatch.setattr(pipeline._Run, "_write_report", lambda self: None)
     monkeypatch.setattr(revisit, "load_slam", lambda folder, device=None: Slam.load(folder.map, device))
     monkeypatch.setattr(revisit, "open_source", lambda source: FakeSequence(8, unreadable=(6,)))
     return Slam
@@ -60,6 +61,22 @@ def test_run_records_how_to_open_the_input_again(faked, tmp_path):
     source = read_json(tmp_path / "input.json")
     assert source["path"].startswith("/") and source["path"].endswith("seq")
     assert (source["dataset"], source["camera"]) == ("icl", "1,1,1,1,2,2,1000")
+    assert source["command"] == f"warpslam run seq --dataset icl --camera 1,1,1,1,2,2,1000 -o {tmp_path}"
+
+
+def test_report_of_one_run_and_of_several(faked, tmp_path, monkeypatch, capsys):
+    """One run: its report, in its folder or where it is told to. Several: a comparison."""
+    for name in ("a", "b"):
+        cli.main(["run", "seq", "--frames", "0:3", "-o", str(tmp_path / name)])
+    monkeypatch.setattr("warpslam.report.images.SUPERSAMPLING", 1)
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+    for arguments in (["a"], ["a", "-o", "other.html"], ["a", "b"]):
+        assert cli.main(["report", *arguments]) == 0
+    assert capsys.readouterr().out.split() == ["a/report.html", "other.html", "comparison.html"]
+    assert "<h1>2 runs</h1>" in (tmp_path / "comparison.html").read_text()
+    assert (tmp_path / "a/report.html").read_text() == (tmp_path / "other.html").read_text()
+    assert cli.main(["report", "a", "nowhere"]) == 2
 
 
 def test_interrupted_run_exits_130_with_partial_results(faked, tmp_path, monkeypatch):
@@ -77,6 +94,7 @@ def test_interrupted_run_exits_130_with_partial_results(faked, tmp_path, monkeyp
         (["eval", "/no/such/run"], "/no/such/run"),
         (["render", "/no/such/run", "--frame", "0"], "/no/such/run"),
         (["mesh", "/no/such/run"], "/no/such/run"),
+        (["report", "/no/such/run"], "/no/such/run"),
         (["demo", "--set", "mapping.windw=3"], "mapping.windw"),
         (["demo", "--set", "mapping"], "mapping"),
         (["demo", "--device", "cuda:77"], "cuda:77"),

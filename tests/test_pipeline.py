@@ -16,7 +16,7 @@ from warpslam import pipeline, revisit
 from warpslam.config import Config
 from warpslam.errors import ConfigError, DatasetError, InputError, MeshError
 from warpslam.evaluation import read_tum
-from warpslam.plots import top_view_axes
+from warpslam.plots import load_panels, top_view_axes
 from warpslam.run_folder import RunFolder, Source, read_json, to_json
 
 
@@ -34,6 +34,7 @@ def fake_slam(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
     monkeypatch.setattr(pipeline, "build_slam", build)
     monkeypatch.setattr(pipeline, "load_slam", lambda folder, device=None: Slam.load(folder.map, device))
     monkeypatch.setattr(revisit, "load_slam", lambda folder, device=None: Slam.load(folder.map, device))
+    monkeypatch.setattr("warpslam.report.images.SUPERSAMPLING", 1)
     return Slam
 
 
@@ -48,7 +49,8 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
     assert result.status == "finished"
     assert {file.name for file in folder.path.iterdir()} == {
         "config.yaml", "trajectory.tum", "ground_truth.tum", "mesh.ply", "map.npz", "metrics.json", "timing.json",
-        "input.json", "log.txt", "trajectory_top_view.png", "error_over_time.png", "panels.png",
+        "input.json", "log.txt", "trajectory_top_view.png", "error_over_time.png", "panels.png", "panels.npz",
+        "frames.json", "report.html",
     }  # fmt: skip
     assert yaml.safe_load(folder.config.read_text())["mapping"]["window"] == Config().mapping.window
     metrics = metrics_of(folder.path)
@@ -74,6 +76,13 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
     assert timing["stages_seconds"]["finish_refinement"] == 0.5
     assert timing["phases"]["mapping"] == {"seconds": 4.0, "calls": 8, "mean_seconds": 0.5}
     assert timing["frames"][2] == {"index": 2, "tracking": 0.25, "mapping": 0.5}
+    frames = read_json(folder.frame_records)
+    assert frames["left_out"] == [] and frames["frames"][2] == {
+        "index": 2, "timestamp": 2 / 30, "status": "OK", "message": "", "inliers": 0.9, "losses": {"loss": 1.5},
+    }  # fmt: skip
+    panels = load_panels(folder.panel_images)
+    assert [panel.index for panel in panels] == [0, 2, 5, 7] and panels[1].rgb[0, 0].tolist() == [42, 42, 42]
+    assert panels[0].rendered_depth[0, 0] == pytest.approx(2.03, abs=1e-3)
     assert "frame 7: OK" in folder.log.read_text()
     for file in folder.path.glob("*.png"):
         assert np.asarray(Image.open(file).convert("L")).std() > 5, f"{file.name} is blank"
@@ -91,6 +100,8 @@ def test_unreadable_frames_are_left_out_and_counted(fake_slam, tmp_path):
     result = pipeline.run(FakeSequence(8, unreadable=(0, 3, 7)), Config(), tmp_path)
     assert result.metrics["frames"]["unreadable"] == 3 and result.metrics["frames"]["processed"] == 5
     assert "frame 3 left out: frame000003.jpg is truncated" in result.folder.log.read_text()
+    left_out = read_json(result.folder.frame_records)["left_out"]
+    assert left_out[1] == {"index": 3, "message": "frame000003.jpg is truncated"}
     np.testing.assert_array_equal(read_tum(result.folder.trajectory)[0], np.array([1, 2, 4, 5, 6]) / 30)
 
 

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import logging
+import os
+import platform
 import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpslam.errors import ConfigError, DatasetError, InputError, MeshError
+from warpslam.errors import ConfigError, DatasetError, InputError, MeshError, WarpSlamError
 from warpslam.evaluation import (
     AteResult,
     ReconstructionResult,
@@ -134,10 +137,12 @@ class _Run:
         self.modules: list[ModuleProgress] = []
         self.slam: Slam | None = None
         self.status = "finished"
+        self.started = datetime.now().astimezone()
         self.frame_indices: list[int] = []
         self.truth_poses: list[np.ndarray] = []
         self.results: list[FrameResult] = []
         self.unreadable_count = 0
+        self.left_out: list[dict[str, Any]] = []
         self.seconds: dict[str, float] = defaultdict(float)
         self.ate: AteResult | None = None
         self.reconstruction: ReconstructionResult | None = None
@@ -158,6 +163,7 @@ class _Run:
                 self._write_trajectory()
                 self._evaluate_trajectory()
                 self._write_map()
+                self._describe_map()
                 self._write_mesh()
                 self._evaluate_reconstruction()
                 self._draw_plots()
@@ -173,7 +179,9 @@ class _Run:
         finally:
             self.seconds["total"] = time.perf_counter() - start
             self._write_timing()
+            self._write_frames()
             self._write_metrics()
+            self._write_report()
         return RunResult(self.folder, self.status, self.metrics, self.ate, self.reconstruction)
 
     def _write_input(self) -> None:
@@ -217,6 +225,7 @@ class _Run:
                     frame = self.sequence[index]
             except DatasetError as error:
                 self.unreadable_count += 1
+                self.left_out.append({"index": index, "message": str(error)})
                 log.warning("frame %d left out: %s", index, error)
                 continue
             yield frame
@@ -267,6 +276,14 @@ class _Run:
         with self._clock("saving"):
             self.slam.save(self.folder.map)
 
+    def _describe_map(self) -> None:
+        from warpslam.inventory import take_inventory
+        from warpslam.slam import Slam
+
+        if isinstance(self.slam, Slam):
+            with self._clock("inventory"):
+                self.metrics.update(take_inventory(self.slam))
+
     def _write_mesh(self) -> None:
         assert self.slam is not None
         from warpslam.meshing import write_ply
@@ -300,7 +317,7 @@ class _Run:
         self.metrics["reconstruction"] = reconstruction_metrics(self.reconstruction)
 
     def _draw_plots(self) -> None:
-        from warpslam.plots import plot_error, plot_panels, plot_top_view
+        from warpslam.plots import plot_error, plot_panels, plot_top_view, save_panels
 
         trajectory, count = self._trajectory()
         poses, status = trajectory.poses[:count], trajectory.status[:count]
@@ -314,6 +331,7 @@ class _Run:
         panels = self._render_panels(poses)
         with self._clock("plotting"):
             plot_panels(self.folder.panels, panels)
+            save_panels(self.folder.panel_images, panels)
         self.metrics["rendering"] = {
             "frames": [panel.index for panel in panels],
             "depth_l1_m": float(np.mean([depth_l1(panel.rendered_depth, panel.depth) for panel in panels])),
@@ -361,8 +379,37 @@ class _Run:
             },
         )
 
+    def _write_frames(self) -> None:
+        frames = [
+            {
+                "index": index,
+                "timestamp": result.timestamp,
+                "status": result.status,
+                "message": result.message,
+                "inliers": result.inliers,
+                "losses": result.losses,
+            }
+            for index, result in zip(self.frame_indices, self.results, strict=False)
+        ]
+        write_json(self.folder.frame_records, {"frames": frames, "left_out": self.left_out})
+
+    def _write_report(self) -> None:
+        from warpslam.report import write_report
+
+        try:
+            write_report(self.folder)
+        except WarpSlamError as error:
+            # The run is done and its figures are written; what stands in the way is in the log and on the terminal.
+            log.error("no report: %s", error)
+        except Exception:
+            # Must not take the place of the error that ended the run.
+            if self.status != "failed":
+                raise
+            log.exception("no report")
+
     def _write_metrics(self) -> None:
         from warpslam import __version__
+        from warpslam.versions import package_versions
 
         statuses = Counter(result.status for result in self.results)
         frame_seconds = self.seconds["frames"]
@@ -387,6 +434,10 @@ class _Run:
             "compiled_kernels": sorted(module.name for module in self.modules if module.compiled),
             "fps": len(self.results) / frame_seconds if frame_seconds > 0 else None,
             "peak_memory_mib": _peak_memory_mib(),
+            "started": self.started.isoformat(timespec="seconds"),
+            "versions": {"warpslam": __version__, "python": platform.python_version(), **package_versions()},
+            "platform": platform.platform(),
+            "processors": os.cpu_count(),
             **self.metrics,
         }
         write_json(self.folder.metrics, self.metrics)

@@ -17,13 +17,16 @@ from warpslam.errors import ConfigError, DatasetError
 _WRITTEN_FILES = (
     "config.yaml",
     "error_over_time.png",
+    "frames.json",
     "ground_truth.tum",
     "input.json",
     "log.txt",
     "map.npz",
     "mesh.ply",
     "metrics.json",
+    "panels.npz",
     "panels.png",
+    "report.html",
     "timing.json",
     "trajectory.tum",
     "trajectory_top_view.png",
@@ -37,18 +40,21 @@ class Source:
     path: Folder of the sequence; None for the built-in demo sequence.
     dataset: Format, as `warpslam.sequences.open_sequence` takes it.
     camera: Camera given by hand, "fx,fy,cx,cy,width,height,depth_scale"; None for the dataset's own.
+    command: Command line that started the run; None if a program did.
     """
 
     path: str | None
     dataset: str = "auto"
     camera: str | None = None
+    command: str | None = None
 
 
 class RunFolder:
     """Paths of one run.
 
     ``config`` effective settings, ``trajectory`` and ``ground_truth`` in TUM format, ``mesh``, ``map`` for later
-    rendering, ``metrics``, ``timing``, ``source`` (how to open the input again), ``log``, and the plots.
+    rendering, ``metrics``, ``timing``, ``frame_records`` (what became of each frame), ``source`` (how to
+    open the input again), ``log``, ``report``, the plots, and the images of the panels as arrays.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -60,11 +66,14 @@ class RunFolder:
         self.map = self.path / "map.npz"
         self.metrics = self.path / "metrics.json"
         self.timing = self.path / "timing.json"
+        self.frame_records = self.path / "frames.json"
         self.source = self.path / "input.json"
         self.log = self.path / "log.txt"
         self.top_view = self.path / "trajectory_top_view.png"
         self.error_plot = self.path / "error_over_time.png"
         self.panels = self.path / "panels.png"
+        self.panel_images = self.path / "panels.npz"
+        self.report = self.path / "report.html"
 
     @classmethod
     def create(cls, path: str | Path | None, name: str, root: str | Path = "runs") -> RunFolder:
@@ -124,7 +133,7 @@ class RunFolder:
         try:
             return Source(**fields)
         except TypeError as error:
-            raise DatasetError(f"{self.source}: expected the fields path, dataset and camera ({error})") from error
+            raise DatasetError(f"{self.source}: expected path, dataset, camera and command ({error})") from error
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -51,7 +51,8 @@ def _run(options: argparse.Namespace) -> int:
     from warpslam.run_folder import Source
 
     quiet_warp()
-    source = Source(str(Path(options.folder).expanduser().resolve()), options.dataset, options.camera)
+    path = str(Path(options.folder).expanduser().resolve())
+    source = Source(path, options.dataset, options.camera, options.command_line)
     sequence = open_source(source)
     config = Config.from_preset(options.preset or sequence.preset, options.overrides)
     truth_mesh = load_mesh(options.truth_mesh) if options.truth_mesh else None
@@ -66,7 +67,7 @@ def _demo(options: argparse.Namespace) -> int:
     quiet_warp()
     config = Config.from_preset(demo.PRESET, [*demo.OVERRIDES, *options.overrides])
     sequence = demo.demo_sequence()
-    return _execute(sequence, config, Source(None), options, truth_mesh=sequence.mesh)
+    return _execute(sequence, config, Source(None, command=options.command_line), options, truth_mesh=sequence.mesh)
 
 
 def _execute(
