@@ -62,6 +62,26 @@ def test_run_records_how_to_open_the_input_again(faked, tmp_path):
     assert (source["dataset"], source["camera"]) == ("icl", "1,1,1,1,2,2,1000")
 
 
+def test_method_and_poses_are_passed_on(faked, tmp_path, capsys, monkeypatch):
+    """--method reaches the run; --poses gives an earlier run's trajectory, which is then not tracked again."""
+    assert cli.main(["run", "seq", "--frames", "0:4", "-o", str(tmp_path / "a")]) == 0
+    assert not faked.configs[-1].tracking.use_given_poses
+    assert "map         2.50 MB, 102,598 FLOP a point" in capsys.readouterr().out
+    poses = str(tmp_path / "a" / "trajectory.tum")
+    assert cli.main(["run", "seq", "--frames", "0:4", "--poses", poses, "-o", str(tmp_path / "b")]) == 0
+    assert faked.configs[-1].tracking.use_given_poses
+    assert read_json(tmp_path / "b" / "metrics.json")["poses"] == poses
+    methods = []
+
+    def build(method, intrinsics, config, device, seed):
+        methods.append(method)
+        return faked(intrinsics, config=config)
+
+    monkeypatch.setattr(pipeline, "build_baseline", build)
+    assert cli.main(["run", "seq", "--method", "tsdf", "--frames", "0:4", "-o", str(tmp_path / "c")]) == 0
+    assert methods == ["tsdf"] and read_json(tmp_path / "c" / "metrics.json")["method"] == "tsdf"
+
+
 def test_interrupted_run_exits_130_with_partial_results(faked, tmp_path, monkeypatch):
     """Ctrl-C ends in the usual exit code and a run folder that can be used."""
     monkeypatch.setattr(faked, "interrupt_at", 3)

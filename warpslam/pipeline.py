@@ -9,6 +9,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,23 +20,28 @@ from warpslam.evaluation import (
     AteResult,
     ReconstructionResult,
     Statistics,
+    associate,
     ate,
     cull_mesh,
     depth_l1,
     evaluate_reconstruction,
+    read_tum,
     rpe,
     write_tum,
 )
-from warpslam.run_folder import RunFolder, Source, write_json
+from warpslam.method import DEFAULT_METHOD, build_method, load_method
+from warpslam.run_folder import RunFolder, Source, read_json, write_json
 
 if TYPE_CHECKING:
     import trimesh
 
     from warpslam.camera import Intrinsics
     from warpslam.config import Config
+    from warpslam.method import Method
     from warpslam.plots import Panel
     from warpslam.sequences.base import Frame, RgbdSequence
-    from warpslam.slam import FrameResult, Slam, Trajectory
+    from warpslam.slam import FrameResult
+    from warpslam.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
@@ -87,6 +93,8 @@ def run(
     source: Source | None = None,
     truth_mesh: trimesh.Trimesh | None = None,
     on_frame: Callable[[Progress], None] | None = None,
+    method: str = DEFAULT_METHOD,
+    poses: str | Path | None = None,
 ) -> RunResult:
     """Run SLAM over a sequence and write a run folder.
 
@@ -100,6 +108,9 @@ def run(
         source: How to open ``sequence`` again, for `warpslam render`.
         truth_mesh: True surface in the world frame of the sequence; adds the reconstruction metrics.
         on_frame: Called after each frame.
+        method: One of `warpslam.method.METHODS`.
+        poses: Trajectory in the TUM format whose poses are given to the method in place of the sequence's own; frames
+            without one are left out. Errors are against the sequence's own as ever.
 
     Raises:
         WarpSlamError: The input or a setting can't be used. metrics.json is written even so.
@@ -107,7 +118,10 @@ def run(
     selected = _select(sequence, frames)
     folder = RunFolder.create(output, sequence.name)
     with _log_file(folder.log):
-        return _Run(sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame).execute()
+        given = None if poses is None else GivenPoses.read(poses)
+        return _Run(
+            sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame, method, given
+        ).execute()
 
 
 class _Run:
@@ -122,10 +136,13 @@ class _Run:
         source: Source | None,
         truth_mesh: trimesh.Trimesh | None,
         on_frame: Callable[[Progress], None] | None,
+        method: str,
+        given: GivenPoses | None,
     ) -> None:
+        self.method, self.given = method, given
         self.sequence, self.config, self.folder, self.selected = sequence, config, folder, selected
         self.device, self.seed, self.source, self.truth_mesh, self.on_frame = device, seed, source, truth_mesh, on_frame
-        self.slam: Slam | None = None
+        self.slam: Method | None = None
         self.status = "finished"
         self.frame_indices: list[int] = []
         self.truth_poses: list[np.ndarray] = []
@@ -177,7 +194,8 @@ class _Run:
 
     def _build_slam(self) -> None:
         with self._clock("setup"):
-            self.slam = build_slam(self.sequence.intrinsics, self.config, self.device, self.seed)
+            build = build_slam if self.method == DEFAULT_METHOD else partial(build_baseline, self.method)
+            self.slam = build(self.sequence.intrinsics, self.config, self.device, self.seed)
         self.seconds["kernel_compile"] = self.slam.compile_seconds
 
     def _process_frames(self) -> None:
@@ -190,9 +208,8 @@ class _Run:
                     T_world_camera = None
                 self.frame_indices.append(frame.index)
                 self.truth_poses.append(np.full((4, 4), np.nan) if T_world_camera is None else T_world_camera)
-                result = self.slam.step(
-                    frame.rgb, frame.depth, timestamp=frame.timestamp, T_world_camera=T_world_camera
-                )
+                given = T_world_camera if self.given is None else self.given.at(frame.timestamp)
+                result = self.slam.step(frame.rgb, frame.depth, timestamp=frame.timestamp, T_world_camera=given)
                 self.results.append(result)
                 level = logging.INFO if result.status == "OK" else logging.WARNING
                 log.log(level, "frame %d: %s", frame.index, _describe(result))
@@ -209,6 +226,10 @@ class _Run:
             except DatasetError as error:
                 self.unreadable_count += 1
                 log.warning("frame %d left out: %s", index, error)
+                continue
+            if self.given is not None and self.given.at(frame.timestamp) is None:
+                self.unreadable_count += 1
+                log.warning("frame %d left out: %s has no pose for %.3f s", index, self.given.path, frame.timestamp)
                 continue
             yield frame
 
@@ -257,6 +278,7 @@ class _Run:
         assert self.slam is not None
         with self._clock("saving"):
             self.slam.save(self.folder.map)
+        self.metrics["map"] = {"bytes": self.slam.map_bytes, "flops_per_point": self.slam.flops_per_point}
 
     def _write_mesh(self) -> None:
         assert self.slam is not None
@@ -357,6 +379,8 @@ class _Run:
         self.metrics = {
             "warpslam": __version__,
             "sequence": self.sequence.name,
+            "method": self.method,
+            "poses": None if self.given is None else self.given.path,
             "status": self.status,
             "device": str(self.slam.device) if self.slam is not None else self.device,
             "seed": self.seed,
@@ -387,32 +411,59 @@ class _Run:
             self.seconds[stage] += time.perf_counter() - start
 
 
-def build_slam(intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Slam:
+@dataclass(frozen=True)
+class GivenPoses:
+    """Poses that a file gives to frames, by time.
+
+    path: File. times: [s], shape (N,). poses: T_world_camera, shape (N, 4, 4).
+    """
+
+    path: Path
+    times: np.ndarray
+    poses: np.ndarray
+
+    @classmethod
+    def read(cls, path: str | Path) -> GivenPoses:
+        """Read a trajectory in the TUM format, such as an earlier run's trajectory.tum.
+
+        Raises:
+            DatasetError: The file can't be read.
+        """
+        return cls(Path(path), *read_tum(path))
+
+    def at(self, timestamp: float) -> np.ndarray | None:
+        """The pose nearest in time, within 20 ms; None if there is none."""
+        position = int(associate(np.array([timestamp]), self.times)[0])
+        return None if position < 0 else self.poses[position]
+
+
+def build_slam(intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Method:
     """The SLAM object of a run.
 
     Raises:
         ConfigError: There is no such device.
         CheckpointError: The decoders can't be loaded.
     """
-    from warpslam.slam import Slam
+    return build_baseline(DEFAULT_METHOD, intrinsics, config, device, seed)
 
+
+def build_baseline(method: str, intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Method:
+    """Any method of a run, by name; see `warpslam.method.build_method` for what it raises."""
     _check_device(device)
-    return Slam(intrinsics, config=config, device=device, seed=seed)
+    return build_method(method, intrinsics, config, device, seed)
 
 
-def load_slam(folder: RunFolder, device: str | None = None) -> Slam:
-    """The SLAM object as a run left it.
+def load_slam(folder: RunFolder, device: str | None = None) -> Method:
+    """The SLAM object (or the baseline) as a run left it.
 
     Raises:
         ConfigError: There is no such device.
         DatasetError: The run saved no map.
         CheckpointError: The map can't be loaded.
     """
-    from warpslam.slam import Slam
-
     path = folder.require(folder.map, "the run stopped before it had a map")
     _check_device(device)
-    return Slam.load(path, device=device)
+    return load_method(read_json(folder.metrics).get("method", DEFAULT_METHOD), path, device)
 
 
 def _check_device(device: str | None) -> None:
@@ -423,7 +474,7 @@ def _check_device(device: str | None) -> None:
         raise ConfigError(f"device {device!r} is not there; this machine has {', '.join(names)}")
 
 
-def render_panel(slam: Slam, frame: Frame, T_world_camera: np.ndarray, stride: int = 1) -> Panel:
+def render_panel(slam: Method, frame: Frame, T_world_camera: np.ndarray, stride: int = 1) -> Panel:
     """A frame beside what the map renders from ``T_world_camera`` (4, 4), every ``stride``-th pixel of both."""
     from warpslam.plots import Panel
 
