@@ -1,0 +1,638 @@
+"""iMAP*: one network for density and colour (Sucar et al. 2021, as NICE-SLAM's authors re-implemented it), forward and
+adjoint; density compositing; importance samples.
+
+    e = sin(p B) in R^93;  h_0 = e;  h_k = relu(W_k h_{k-1} + b_k), k = 1..4, 256 wide;  raw = W_o h_4 + b_o in R^4
+    alpha_i = 1 - exp(-relu(density_i) delta_i |d|),   delta_i = z_{i+1} - z_i, of the last sample 1e10
+    w_i = alpha_i T_i,   T_i = prod_{j < i} (1 - alpha_j + 1e-10);   depth, rgb and variance as in `compositing`
+
+Adjoint of compositing, with g_i = d_depth z_i + d_rgb . c_i:
+
+    d_alpha_i = g_i T_i - sum_{k > i} g_k w_k / (1 - alpha_i + 1e-10)
+    d_density_i = d_alpha_i (1 - alpha_i) delta_i |d| where density_i > 0;   d_c_i = w_i d_rgb
+
+A sample outside the map's bound counts as density 100 and has no gradient.
+
+Lengths are in network units (metres times the scale of the settings). Points are numbered ray * sample_count + sample;
+samples are stored in the order in which they are made (stratified, importance, empty space), and ``order`` tells the
+order along the ray.
+
+Activations are arrays (blocks, points) of `Vec32`: the embedding has 3 blocks (96 channels, 93 used), a layer 8.
+Weights are rows of `Vec32`: row k of an output block holds what input k adds to the block's 32 outputs. A forward
+kernel works out one block of one layer for four points a thread, so that each row it reads serves four points. The
+adjoint of a layer is the same product with the transposed rows, masked by the activations it flows into; weight
+gradients are x^T d over chunks of points, eight rows a thread.
+"""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from warpslam.kernels.compositing import is_inside
+from warpslam.kernels.decoder import angles, cosine32, sample_index, sample_point, sine32, sum32
+from warpslam.kernels.grid import Vec32
+from warpslam.kernels.rays import stratum
+
+BLOCKS = 8
+EMBEDDING_BLOCKS = 3
+LAYERS = 4
+
+# Rows of the weights: B as in the decoders, then the layers, block by block.
+LAYER = (9, 9 + 8 * 96, 9 + 8 * 96 + 8 * 256, 9 + 8 * 96 + 16 * 256)
+BIAS = 9 + 8 * 96 + 24 * 256  # 8 rows a layer
+OUT = BIAS + 32  # 8 rows an output (red, green, blue, density), then one row of output biases
+WEIGHT_ROWS = OUT + 33
+
+# Rows of the transposed weights: for each input block of a layer, one row an output.
+LAYER_T = (0, 3 * 256, 3 * 256 + 8 * 256, 3 * 256 + 16 * 256)
+TRANSPOSED_ROWS = 3 * 256 + 24 * 256
+
+FORWARD = wp.constant(0)
+ADJOINT = wp.constant(1)
+UNMASKED = wp.constant(2)
+
+OUTSIDE_DENSITY = wp.constant(100.0)
+_FARTHEST = wp.constant(1.0e10)
+
+
+def imap_kernels(target: str) -> SimpleNamespace:
+    """All kernels for ``target`` "cpu" or "cuda", in the Warp module ``warpslam.imap_<target>``."""
+    unrolled = target == "cpu"
+    module = f"warpslam.imap_{target}"
+    wp.get_module(module).options.update({"enable_backward": False, "max_unroll": 4})
+
+    def kernel(f):
+        return wp.kernel(f, module=module, name=f.__name__, enable_backward=False)
+
+    def func(f):
+        return wp.func(f, module=module, name=f.__name__)
+
+    @func
+    def masked_relu(a: Vec32, gate: Vec32) -> Vec32:
+        """``a`` where ``gate`` is above 0."""
+        r = Vec32()
+        for i in range(32):
+            r[i] = wp.where(gate[i] > 0.0, a[i], 0.0)
+        return r
+
+    @kernel
+    def embed(
+        first_ray: int,
+        first_sample: int,
+        width: int,
+        sample_count: int,
+        ray_origin: wp.array(dtype=wp.vec3),
+        ray_direction: wp.array(dtype=wp.vec3),
+        z: wp.array(dtype=float),
+        W: wp.array(dtype=Vec32),
+        embedding: wp.array2d(dtype=Vec32),
+    ):
+        point = sample_index(wp.tid(), first_ray, first_sample, width, sample_count)
+        p = sample_point(point, sample_count, ray_origin, ray_direction, z)
+        for chunk in range(3):
+            embedding[chunk, point] = sine32(angles(p, W, chunk))
+
+    @kernel
+    def product(
+        point_count: int,
+        first_ray: int,
+        first_sample: int,
+        width: int,
+        sample_count: int,
+        trips: int,
+        in_blocks: int,
+        W: wp.array(dtype=Vec32),
+        row: int,
+        bias: wp.array(dtype=Vec32),
+        bias_row: int,
+        x: wp.array2d(dtype=Vec32),
+        mode: int,
+        gate: wp.array2d(dtype=Vec32),
+        y: wp.array2d(dtype=Vec32),
+    ):
+        """A layer forward (FORWARD: bias and ReLU), or its adjoint (ADJOINT: masked by ``gate``; UNMASKED)."""
+        block, group = wp.tid()
+        # The last group may be short of points: it computes its last one again.
+        last = point_count - 1
+        p0 = sample_index(wp.min(4 * group, last), first_ray, first_sample, width, sample_count)
+        p1 = sample_index(wp.min(4 * group + 1, last), first_ray, first_sample, width, sample_count)
+        p2 = sample_index(wp.min(4 * group + 2, last), first_ray, first_sample, width, sample_count)
+        p3 = sample_index(wp.min(4 * group + 3, last), first_ray, first_sample, width, sample_count)
+        r0 = Vec32()
+        if mode == FORWARD:
+            r0 = Vec32(bias[bias_row + block])
+        r1 = Vec32(r0)
+        r2 = Vec32(r0)
+        r3 = Vec32(r0)
+        for source in range(in_blocks):
+            x0 = x[source, p0]
+            x1 = x[source, p1]
+            x2 = x[source, p2]
+            x3 = x[source, p3]
+            first = row + 32 * (block * in_blocks + source)
+            if wp.static(unrolled):
+                for k in range(32):
+                    w = W[first + k]
+                    r0 += x0[k] * w
+                    r1 += x1[k] * w
+                    r2 += x2[k] * w
+                    r3 += x3[k] * w
+            else:
+                for k in range(trips):
+                    w = W[first + k]
+                    r0 += x0[k] * w
+                    r1 += x1[k] * w
+                    r2 += x2[k] * w
+                    r3 += x3[k] * w
+        if mode == FORWARD:
+            y[block, p0] = masked_relu(r0, r0)
+            y[block, p1] = masked_relu(r1, r1)
+            y[block, p2] = masked_relu(r2, r2)
+            y[block, p3] = masked_relu(r3, r3)
+        elif mode == ADJOINT:
+            y[block, p0] = masked_relu(r0, gate[block, p0])
+            y[block, p1] = masked_relu(r1, gate[block, p1])
+            y[block, p2] = masked_relu(r2, gate[block, p2])
+            y[block, p3] = masked_relu(r3, gate[block, p3])
+        else:
+            y[block, p0] = r0
+            y[block, p1] = r1
+            y[block, p2] = r2
+            y[block, p3] = r3
+
+    @kernel
+    def output(
+        first_ray: int,
+        first_sample: int,
+        width: int,
+        sample_count: int,
+        W: wp.array(dtype=Vec32),
+        h: wp.array2d(dtype=Vec32),
+        color: wp.array(dtype=wp.vec3),
+        density: wp.array(dtype=float),
+    ):
+        point = sample_index(wp.tid(), first_ray, first_sample, width, sample_count)
+        raw = wp.vec4()
+        for channel in range(4):
+            total = Vec32()
+            for block in range(8):
+                total += wp.cw_mul(h[block, point], W[OUT + 8 * channel + block])
+            raw[channel] = sum32(total) + W[OUT + 32][channel]
+        color[point] = wp.vec3(raw[0], raw[1], raw[2])
+        density[point] = raw[3]
+
+    @kernel
+    def output_backward(
+        start: int,
+        W: wp.array(dtype=Vec32),
+        h: wp.array2d(dtype=Vec32),
+        color_grad: wp.array(dtype=wp.vec3),
+        density_grad: wp.array(dtype=float),
+        d: wp.array2d(dtype=Vec32),
+    ):
+        point = start + wp.tid()
+        c = color_grad[point]
+        s = density_grad[point]
+        for block in range(8):
+            g = c[0] * W[OUT + block] + c[1] * W[OUT + 8 + block] + c[2] * W[OUT + 16 + block]
+            d[block, point] = masked_relu(g + s * W[OUT + 24 + block], h[block, point])
+
+    @kernel
+    def embed_backward(
+        start: int,
+        sample_count: int,
+        ray_origin: wp.array(dtype=wp.vec3),
+        ray_direction: wp.array(dtype=wp.vec3),
+        z: wp.array(dtype=float),
+        W: wp.array(dtype=Vec32),
+        d: wp.array2d(dtype=Vec32),
+        want_point: int,
+        point_grad: wp.array(dtype=wp.vec3),
+    ):
+        """From the gradient of the embedding to that of its angles p B (in place), and of the point."""
+        point = start + wp.tid()
+        p = sample_point(point, sample_count, ray_origin, ray_direction, z)
+        dp = wp.vec3()
+        for chunk in range(3):
+            da = wp.cw_mul(d[chunk, point], cosine32(angles(p, W, chunk)))
+            d[chunk, point] = da
+            dp += wp.vec3(
+                sum32(wp.cw_mul(da, W[3 * chunk])),
+                sum32(wp.cw_mul(da, W[3 * chunk + 1])),
+                sum32(wp.cw_mul(da, W[3 * chunk + 2])),
+            )
+        if want_point != 0:
+            point_grad[point] = point_grad[point] + dp
+
+    @kernel
+    def layer_weights(
+        start: int,
+        stop: int,
+        chunk_size: int,
+        slot: int,
+        in_blocks: int,
+        row: int,
+        x: wp.array3d(dtype=float),
+        d: wp.array2d(dtype=Vec32),
+        grad: wp.array2d(dtype=Vec32),
+    ):
+        """x^T d over a chunk of points: rows 8 r to 8 r + 7 of the input, one block of the output, a thread.
+
+        ``x`` are activations with their channels as a third axis: reading one channel must not load the other 31.
+        """
+        chunk, block, r = wp.tid()
+        first = start + chunk * chunk_size
+        last = wp.min(first + chunk_size, stop)
+        source = r // 4
+        k = 8 * (r % 4)
+        g0 = Vec32()
+        g1 = Vec32()
+        g2 = Vec32()
+        g3 = Vec32()
+        g4 = Vec32()
+        g5 = Vec32()
+        g6 = Vec32()
+        g7 = Vec32()
+        for n in range(first, last):
+            dn = d[block, n]
+            g0 += x[source, n, k] * dn
+            g1 += x[source, n, k + 1] * dn
+            g2 += x[source, n, k + 2] * dn
+            g3 += x[source, n, k + 3] * dn
+            g4 += x[source, n, k + 4] * dn
+            g5 += x[source, n, k + 5] * dn
+            g6 += x[source, n, k + 6] * dn
+            g7 += x[source, n, k + 7] * dn
+        target_row = row + 32 * (block * in_blocks + source) + k
+        wp.atomic_add(grad, slot, target_row, g0)
+        wp.atomic_add(grad, slot, target_row + 1, g1)
+        wp.atomic_add(grad, slot, target_row + 2, g2)
+        wp.atomic_add(grad, slot, target_row + 3, g3)
+        wp.atomic_add(grad, slot, target_row + 4, g4)
+        wp.atomic_add(grad, slot, target_row + 5, g5)
+        wp.atomic_add(grad, slot, target_row + 6, g6)
+        wp.atomic_add(grad, slot, target_row + 7, g7)
+
+    @kernel
+    def bias_weights(
+        start: int,
+        stop: int,
+        chunk_size: int,
+        slot: int,
+        row: int,
+        d: wp.array2d(dtype=Vec32),
+        grad: wp.array2d(dtype=Vec32),
+    ):
+        chunk, block = wp.tid()
+        first = start + chunk * chunk_size
+        last = wp.min(first + chunk_size, stop)
+        g = Vec32()
+        for n in range(first, last):
+            g += d[block, n]
+        wp.atomic_add(grad, slot, row + block, g)
+
+    @kernel
+    def output_weights(
+        start: int,
+        stop: int,
+        chunk_size: int,
+        slot: int,
+        h: wp.array2d(dtype=Vec32),
+        color_grad: wp.array(dtype=wp.vec3),
+        density_grad: wp.array(dtype=float),
+        grad: wp.array2d(dtype=Vec32),
+    ):
+        chunk, block = wp.tid()
+        first = start + chunk * chunk_size
+        last = wp.min(first + chunk_size, stop)
+        red = Vec32()
+        green = Vec32()
+        blue = Vec32()
+        dense = Vec32()
+        bias = Vec32()
+        for n in range(first, last):
+            c = color_grad[n]
+            s = density_grad[n]
+            x = h[block, n]
+            red += c[0] * x
+            green += c[1] * x
+            blue += c[2] * x
+            dense += s * x
+            bias[0] = bias[0] + c[0]
+            bias[1] = bias[1] + c[1]
+            bias[2] = bias[2] + c[2]
+            bias[3] = bias[3] + s
+        wp.atomic_add(grad, slot, OUT + block, red)
+        wp.atomic_add(grad, slot, OUT + 8 + block, green)
+        wp.atomic_add(grad, slot, OUT + 16 + block, blue)
+        wp.atomic_add(grad, slot, OUT + 24 + block, dense)
+        if block == 0:
+            wp.atomic_add(grad, slot, OUT + 32, bias)
+
+    @kernel
+    def embedding_weights(
+        start: int,
+        stop: int,
+        chunk_size: int,
+        slot: int,
+        sample_count: int,
+        ray_origin: wp.array(dtype=wp.vec3),
+        ray_direction: wp.array(dtype=wp.vec3),
+        z: wp.array(dtype=float),
+        d: wp.array2d(dtype=Vec32),
+        grad: wp.array2d(dtype=Vec32),
+    ):
+        """Gradient of B, after `embed_backward`."""
+        chunk, third = wp.tid()
+        first = start + chunk * chunk_size
+        last = wp.min(first + chunk_size, stop)
+        gx = Vec32()
+        gy = Vec32()
+        gz = Vec32()
+        for n in range(first, last):
+            p = sample_point(n, sample_count, ray_origin, ray_direction, z)
+            gx += p[0] * d[third, n]
+            gy += p[1] * d[third, n]
+            gz += p[2] * d[third, n]
+        wp.atomic_add(grad, slot, 3 * third, gx)
+        wp.atomic_add(grad, slot, 3 * third + 1, gy)
+        wp.atomic_add(grad, slot, 3 * third + 2, gz)
+
+    @kernel
+    def transpose(in_blocks: int, row: int, row_T: int, W: wp.array(dtype=Vec32), T: wp.array(dtype=Vec32)):
+        """Bring a layer's transposed rows in line with its weights: one thread a row of ``T``."""
+        tid = wp.tid()
+        source = tid // 256
+        output_block = (tid % 256) // 32
+        lane = tid % 32
+        first = row + 32 * (output_block * in_blocks + source)
+        r = Vec32()
+        for k in range(32):
+            r[k] = W[first + k][lane]
+        T[row_T + tid] = r
+
+    @func
+    def density_at(
+        i: int,
+        ray: int,
+        low: wp.vec3,
+        high: wp.vec3,
+        ray_origin: wp.array(dtype=wp.vec3),
+        ray_direction: wp.array(dtype=wp.vec3),
+        z: wp.array(dtype=float),
+        density: wp.array(dtype=float),
+    ) -> float:
+        """Density of a sample, that of outside where it is."""
+        if not is_inside(ray_origin[ray] + z[i] * ray_direction[ray], low, high):
+            return OUTSIDE_DENSITY
+        return density[i]
+
+    @kernel
+    def place_stratified(
+        start: int,
+        seeds: wp.array(dtype=int),
+        iteration: wp.array(dtype=int),
+        jitter: int,
+        count: int,
+        sample_count: int,
+        use_depth: int,
+        depth: wp.array(dtype=float),
+        t_exit: wp.array(dtype=float),
+        max_depth: wp.array(dtype=float),
+        z: wp.array(dtype=float),
+    ):
+        """The strata of `warpslam.kernels.rays`, without samples near the surface."""
+        ray = start + wp.tid()
+        near = float(0.01)
+        far = t_exit[ray] + 0.01
+        if use_depth != 0:
+            near = 0.01 * depth[ray]
+            far = wp.clamp(far, 0.0, 1.2 * max_depth[0])
+        state = wp.rand_init(seeds[iteration[0]] ^ 0x5BD1E995, ray)
+        for n in range(count):
+            z[ray * sample_count + n] = stratum(n, count, near, far, jitter, state)
+
+    @kernel
+    def place_importance(
+        start: int,
+        stratified: int,
+        importance: int,
+        sample_count: int,
+        keep: wp.array(dtype=int),
+        low: wp.vec3,
+        high: wp.vec3,
+        ray_origin: wp.array(dtype=wp.vec3),
+        ray_direction: wp.array(dtype=wp.vec3),
+        density: wp.array(dtype=float),
+        weight: wp.array(dtype=float),
+        z: wp.array(dtype=float),
+        order: wp.array(dtype=int),
+    ):
+        """Inverse CDF of the inner stratified weights over the midpoints between samples, at even steps; and the order
+        of all samples along the ray.
+        """
+        ray = start + wp.tid()
+        first = ray * sample_count
+        if keep[ray] == 0:
+            return
+        norm = wp.length(ray_direction[ray])
+        passed = float(1.0)
+        total = float(0.0)
+        for n in range(stratified):
+            i = first + n
+            delta = _FARTHEST
+            if n + 1 < stratified:
+                delta = z[i + 1] - z[i]
+            sigma = density_at(i, ray, low, high, ray_origin, ray_direction, z, density)
+            alpha = 1.0 - wp.exp(-wp.max(sigma, 0.0) * delta * norm)
+            w = alpha * passed
+            passed *= 1.0 - alpha + 1.0e-10
+            weight[i] = w
+            if n > 0 and n + 1 < stratified:
+                total += w + 1.0e-5
+        # Bin b reaches from midpoint b to midpoint b + 1 and has the weight of sample b + 1.
+        cell = int(0)
+        below = float(0.0)
+        above = (weight[first + 1] + 1.0e-5) / total
+        for n in range(importance):
+            u = float(n) / float(importance - 1)
+            while u >= above and cell + 3 < stratified:
+                cell += 1
+                below = above
+                above += (weight[first + cell + 1] + 1.0e-5) / total
+            left = 0.5 * (z[first + cell] + z[first + cell + 1])
+            right = 0.5 * (z[first + cell + 1] + z[first + cell + 2])
+            share = wp.clamp((u - below) / (above - below), 0.0, 1.0)
+            z[first + stratified + n] = left + share * (right - left)
+        a = int(0)
+        b = int(0)
+        for n in range(stratified + importance):
+            take_a = a < stratified
+            if take_a and b < importance:
+                take_a = z[first + a] <= z[first + stratified + b]
+            if take_a:
+                order[first + n] = first + a
+                a += 1
+            else:
+                order[first + n] = first + stratified + b
+                b += 1
+
+    @kernel
+    def place_empty(
+        start: int,
+        seeds: wp.array(dtype=int),
+        iteration: wp.array(dtype=int),
+        first_sample: int,
+        count: int,
+        sample_count: int,
+        depth: wp.array(dtype=float),
+        z: wp.array(dtype=float),
+    ):
+        """Jittered samples in [0, 0.85 D], where nothing should be."""
+        ray = start + wp.tid()
+        state = wp.rand_init(seeds[iteration[0]] ^ 0x3C6EF372, ray)
+        for n in range(count):
+            s = (float(n) + wp.randf(state)) / float(count)
+            z[ray * sample_count + first_sample + n] = 0.85 * depth[ray] * s
+
+    @kernel
+    def composite(
+        start: int,
+        visible: int,
+        sample_count: int,
+        keep: wp.array(dtype=int),
+        low: wp.vec3,
+        high: wp.vec3,
+        ray_origin: wp.array(dtype=wp.vec3),
+        ray_direction: wp.array(dtype=wp.vec3),
+        z: wp.array(dtype=float),
+        order: wp.array(dtype=int),
+        density: wp.array(dtype=float),
+        color: wp.array(dtype=wp.vec3),
+        weight: wp.array(dtype=float),
+        transmittance: wp.array(dtype=float),
+        depth: wp.array(dtype=float),
+        variance: wp.array(dtype=float),
+        rgb: wp.array(dtype=wp.vec3),
+    ):
+        """Weight of, and transmittance in front of, each of the ``visible`` samples; depth, variance, colour."""
+        ray = start + wp.tid()
+        first = ray * sample_count
+        d = float(0.0)
+        v = float(0.0)
+        c = wp.vec3()
+        if keep[ray] != 0:
+            norm = wp.length(ray_direction[ray])
+            passed = float(1.0)
+            for n in range(visible):
+                i = order[first + n]
+                delta = _FARTHEST
+                if n + 1 < visible:
+                    delta = z[order[first + n + 1]] - z[i]
+                sigma = density_at(i, ray, low, high, ray_origin, ray_direction, z, density)
+                alpha = 1.0 - wp.exp(-wp.max(sigma, 0.0) * delta * norm)
+                weight[i] = alpha * passed
+                transmittance[i] = passed
+                d += weight[i] * z[i]
+                c += weight[i] * color[i]
+                passed *= 1.0 - alpha + 1.0e-10
+            for n in range(visible):
+                i = order[first + n]
+                v += weight[i] * (z[i] - d) * (z[i] - d)
+        depth[ray] = d
+        variance[ray] = v
+        rgb[ray] = c
+
+    @kernel
+    def composite_backward(
+        start: int,
+        visible: int,
+        sample_count: int,
+        keep: wp.array(dtype=int),
+        low: wp.vec3,
+        high: wp.vec3,
+        ray_origin: wp.array(dtype=wp.vec3),
+        ray_direction: wp.array(dtype=wp.vec3),
+        z: wp.array(dtype=float),
+        order: wp.array(dtype=int),
+        density: wp.array(dtype=float),
+        color: wp.array(dtype=wp.vec3),
+        weight: wp.array(dtype=float),
+        transmittance: wp.array(dtype=float),
+        depth_grad: wp.array(dtype=float),
+        rgb_grad: wp.array(dtype=wp.vec3),
+        empty_weight: float,
+        density_grad: wp.array(dtype=float),
+        color_grad: wp.array(dtype=wp.vec3),
+    ):
+        """Adjoint of `composite`; samples behind the ``visible`` ones get that of ``empty_weight`` |density|."""
+        ray = start + wp.tid()
+        first = ray * sample_count
+        d_depth = depth_grad[ray]
+        d_rgb = rgb_grad[ray]
+        # Consumed here, like the adjoint of a store: the next iteration's losses add to zero.
+        depth_grad[ray] = 0.0
+        rgb_grad[ray] = wp.vec3()
+        norm = wp.length(ray_direction[ray])
+        behind = float(0.0)
+        for m in range(visible):
+            n = visible - 1 - m
+            i = first + n
+            gradient = float(0.0)
+            by_color = wp.vec3()
+            if keep[ray] != 0:
+                i = order[first + n]
+                delta = _FARTHEST
+                if m > 0:
+                    delta = z[order[first + n + 1]] - z[i]
+                g = d_depth * z[i] + wp.dot(d_rgb, color[i])
+                by_color = weight[i] * d_rgb
+                inside = is_inside(ray_origin[ray] + z[i] * ray_direction[ray], low, high)
+                if inside and density[i] > 0.0:
+                    free = wp.exp(-density[i] * delta * norm)
+                    gradient = (g * transmittance[i] - behind / (free + 1.0e-10)) * free * delta * norm
+                behind += g * weight[i]
+            density_grad[i] = gradient
+            color_grad[i] = by_color
+        for n in range(visible, sample_count):
+            i = first + n
+            density_grad[i] = wp.where(keep[ray] != 0, empty_weight * wp.sign(density[i]), 0.0)
+            color_grad[i] = wp.vec3()
+
+    @kernel
+    def empty_loss(
+        visible: int,
+        sample_count: int,
+        empty_weight: float,
+        keep: wp.array(dtype=int),
+        density: wp.array(dtype=float),
+        loss: wp.array(dtype=float),
+    ):
+        ray = wp.tid()
+        if keep[ray] != 0:
+            total = float(0.0)
+            for n in range(visible, sample_count):
+                total += wp.abs(density[ray * sample_count + n])
+            wp.atomic_add(loss, 0, empty_weight * total)
+
+    return SimpleNamespace(
+        embed=embed,
+        product=product,
+        output=output,
+        output_backward=output_backward,
+        embed_backward=embed_backward,
+        layer_weights=layer_weights,
+        bias_weights=bias_weights,
+        output_weights=output_weights,
+        embedding_weights=embedding_weights,
+        transpose=transpose,
+        place_stratified=place_stratified,
+        place_importance=place_importance,
+        place_empty=place_empty,
+        composite=composite,
+        composite_backward=composite_backward,
+        empty_loss=empty_loss,
+    )
+
+
+CPU = imap_kernels("cpu")
+CUDA = imap_kernels("cuda")
