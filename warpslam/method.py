@@ -57,7 +57,7 @@ class Method(Protocol):
         ...
 
     def save(self, path: str | Path) -> None:
-        """Write the map and what else is needed to go on from it."""
+        """Write the map, for views and meshes later."""
         ...
 
     @property
