@@ -177,14 +177,20 @@ class ImapConfig(_Group):
 
     scale: float = Field(0.1, gt=0, description="network units per metre")
     importance: int = Field(12, ge=4, le=64, description="samples drawn where the stratified ones found something")
-    empty_samples: int = Field(32, ge=4, le=64, description="samples in front of the surface that should be empty")
+    empty_samples: int = Field(
+        16, ge=4, le=64, description="samples in front of the surface that should be empty; released code 32"
+    )
     empty_weight: float = Field(5e-4, ge=0, description="weight of |density| at those samples")
-    tracking_rate: float = Field(5e-4, gt=0, description="learning rate of the pose")
+    tracking_rate: float = Field(
+        5e-4, gt=0, description="learning rate of the pose in the first iteration; tracking.final_rate_factor applies"
+    )
     tracking_pixels: int = Field(150, ge=16, le=100_000, description="rays per tracking iteration; released code 5000")
-    tracking_iterations: int = Field(10, ge=1, le=10_000, description="iterations per frame; released code 50")
-    mapping_rate: float = Field(2e-4, gt=0, description="learning rate of the network; 0.8 times after every 200 steps")
-    mapping_pixels: int = Field(150, ge=16, le=200_000, description="rays per mapping iteration; released code 5000")
-    first_iterations: int = Field(600, ge=1, description="iterations on the first frame; released code 1500")
+    tracking_iterations: int = Field(12, ge=1, le=10_000, description="iterations per frame; released code 50")
+    mapping_rate: float = Field(
+        1e-3, gt=0, description="learning rate of the network, 0.8 times after every 200 steps; released code 2e-4"
+    )
+    mapping_pixels: int = Field(120, ge=16, le=200_000, description="rays per mapping iteration; released code 5000")
+    first_iterations: int = Field(800, ge=1, description="iterations on the first frame; released code 1500")
     rounds: int = Field(3, ge=1, description="rounds of a mapping call, each with its own random window")
     iterations: int = Field(20, ge=1, description="iterations of a round on later frames; released code 100")
     refinement_rounds: int = Field(5, ge=0, description="rounds of 3 x iterations after the last frame")
@@ -317,9 +323,10 @@ PRESETS: dict[str, dict[str, Any]] = {
     ),
     "paper_imap": {
         "sampling": {"jitter": False},
+        "tracking": {"final_rate_factor": 1.0},
         "imap": {
-            "tracking_pixels": 5000, "tracking_iterations": 50, "mapping_pixels": 5000,
-            "first_iterations": 1500, "iterations": 100,
+            "tracking_pixels": 5000, "tracking_iterations": 50, "mapping_pixels": 5000, "mapping_rate": 2e-4,
+            "empty_samples": 32, "first_iterations": 1500, "iterations": 100,
         },
     },
     "paper_cofusion": _paper(

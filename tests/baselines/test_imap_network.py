@@ -63,7 +63,7 @@ class Case:
         gradient = gradient_buffers(imap.WEIGHT_ROWS, batch.device)
         with wp.Tape() as tape:
             batch.cast(self.poses)
-            batch.bound(self.bound, use_depth=True)
+            batch.bound_to(self.bound.low, self.bound.high)
             # All rays take part, so that samples outside the bound are covered.
             batch.keep.fill_(1)
             batch.max_depth.fill_(float(self.depth.max()))
@@ -193,7 +193,7 @@ def test_rays_that_are_not_kept_have_no_part():
     batch, gradient = case.batch, gradient_buffers(imap.WEIGHT_ROWS, wp.get_device("cpu"))
     with wp.Tape() as tape:
         batch.cast(case.poses)
-        batch.bound(case.bound)
+        batch.bound_to(case.bound.low, case.bound.high)
         batch.keep.zero_()
         batch.evaluate(case.network, case.bound, Wanted(True, gradient), tape, empty_weight=EMPTY_WEIGHT)
         batch.mapping_loss(COLOR_WEIGHT)

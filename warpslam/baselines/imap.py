@@ -19,7 +19,7 @@ import zipfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -146,7 +146,8 @@ class Imap(Baseline):
         start = self._scaled(self._initial_vector())
         settings, batch = self._settings, self._tracking
         iterations = settings.tracking_iterations
-        self._poses.begin(start[None], np.full((1, 2), settings.tracking_rate))
+        decay = self.config.tracking.final_rate_factor ** np.linspace(0.0, 1.0, iterations)[:, None]
+        self._poses.begin(start[None], settings.tracking_rate * decay * [1.0, 1.0])
         batch.set_seeds([ray_seed(self.seed, _TRACKING, index, n) for n in range(iterations)])
 
         def iterate() -> None:
@@ -185,7 +186,7 @@ class Imap(Baseline):
         edges = {"edge_u": config.ignore_edge_u, "edge_v": config.ignore_edge_v}
         batch.draw(self._images.arrays, self._slot_of_frame, batch.capacity, self.intrinsics, **edges)
         batch.cast(self._poses.poses, differentiate=tape is not None)
-        batch.bound(bound)
+        batch.bound_to(bound.low, bound.high)
         batch.evaluate(self.network, bound, wanted, tape, jitter=self.config.sampling.jitter)
         batch.choose_inliers(0.0)
         batch.tracking_loss(TRACKING_COLOR_WEIGHT)
@@ -219,7 +220,7 @@ class Imap(Baseline):
             with wp.Tape() as tape:
                 batch.draw(self._images.arrays, slots, pixels, self.intrinsics)
                 batch.cast(poses)
-                batch.bound(bound)
+                batch.bound_to(bound.low, bound.high)
                 jitter, weight = self.config.sampling.jitter, settings.empty_weight
                 batch.evaluate(self.network, bound, wanted, tape, jitter=jitter, empty_weight=weight)
                 batch.mapping_loss(settings.color_weight)
@@ -350,7 +351,7 @@ class Imap(Baseline):
             if depth is not None:
                 part = np.ascontiguousarray(depth[::stride, ::stride][first : first + count], np.float32)
                 batch.measured_depth[: batch.count].assign(scale * part.reshape(-1))
-            batch.bound(bound, use_depth=guided)
+            batch.bound_to(bound.low, bound.high, use_depth=guided)
             batch.evaluate(self.network, bound, use_depth=guided)
             arrays = ((out.depth, batch.depth, 1 / scale), (out.rgb, batch.rgb, 1.0))
             for image, array, unit in (*arrays, (out.variance, batch.variance, 1 / scale**2)):
@@ -364,18 +365,18 @@ class Imap(Baseline):
         path = Path(path)
         header = {"format": FORMAT, "seed": self.seed, "config": self.config.model_dump()}
         header |= {"intrinsics": vars(self.intrinsics), "status": self._status}
+        arrays: dict[str, Any] = {
+            "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
+            "timestamps": np.array(self._timestamps),
+            "vectors": np.array(self._vectors).reshape(-1, 7),
+            "bounds": np.stack([self._low, self._high]),
+            "seen_frames": np.array([seen.index for seen in self._seen], np.int64),
+            "seen": np.array([seen.millimetres for seen in self._seen], np.uint16),
+        }
+        arrays |= {f"network:{name}": array for name, array in self.network.tensors().items()}
         temporary = path.with_name(path.name + ".part")
         with open(temporary, "wb") as file:
-            np.savez(
-                file,
-                header=np.frombuffer(json.dumps(header).encode(), np.uint8),
-                timestamps=np.array(self._timestamps),
-                vectors=np.array(self._vectors).reshape(-1, 7),
-                bounds=np.stack([self._low, self._high]),
-                seen_frames=np.array([seen.index for seen in self._seen], np.int64),
-                seen=np.array([seen.millimetres for seen in self._seen], np.uint16),
-                **{f"network:{name}": array for name, array in self.network.tensors().items()},
-            )
+            np.savez(file, **arrays)
         os.replace(temporary, path)
 
     @classmethod

@@ -222,9 +222,9 @@ class Tsdf(Baseline):
                 arrays = {name: file[name] for name in file.files}
             if str(arrays.get("format")) != FORMAT:
                 raise CheckpointError(f"{path}: is no TSDF volume of this version; run again with --method tsdf")
-            *focal, width, height = arrays["intrinsics"].tolist()
+            fx, fy, cx, cy, width, height = arrays["intrinsics"].tolist()
             config = Config.model_validate_json(str(arrays["config"]))
-            tsdf = cls(Intrinsics(*focal, int(width), int(height)), config, device)
+            tsdf = cls(Intrinsics(fx, fy, cx, cy, int(width), int(height)), config, device)
             tsdf._timestamps = [float(t) for t in arrays["timestamps"]]
             tsdf._vectors, tsdf._status = list(arrays["vectors"]), [str(s) for s in arrays["status"]]
             if len(arrays["keys"]):
