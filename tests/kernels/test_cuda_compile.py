@@ -13,18 +13,19 @@ import warp as wp
 import warpslam
 
 ARCHITECTURES = (80, 90)
-DECODER = "warpslam.decoder_cuda"
+BUILT = {"warpslam.decoder_cuda": "warpslam.kernels.decoder", "warpslam.imap_cuda": "warpslam.kernels.imap"}
+"""Warp modules that a function builds, and the Python modules that call it."""
 
 
 def kernel_modules() -> list[str]:
-    """Names of the Warp modules that hold kernels; those of the decoders are built by a function, in their own."""
+    """Names of the Warp modules that hold kernels, those that a function builds included."""
     root = Path(warpslam.__file__).parent
     names = [
         ".".join(("warpslam", *path.relative_to(root).with_suffix("").parts))
         for path in sorted(root.rglob("*.py"))
         if re.search(r"^@wp\.kernel", path.read_text(), re.MULTILINE)
     ]
-    return [*names, DECODER]
+    return [*names, *BUILT]
 
 
 def ptx_of(name: str, architecture: int, folder: Path) -> str:
@@ -58,7 +59,7 @@ def test_module_compiles(name, architecture, tmp_path):
     """The PTX of a module targets the architecture and holds an entry for each of its kernels."""
     if architecture not in wp.get_cuda_supported_archs():
         pytest.skip(f"this build of Warp can't compile for sm_{architecture}")
-    importlib.import_module("warpslam.kernels.decoder" if name == DECODER else name)
+    importlib.import_module(BUILT.get(name, name))
     kernels = wp.get_module(name).kernels
     assert kernels
     ptx = ptx_of(name, architecture, tmp_path)
