@@ -30,7 +30,7 @@ from warpslam.camera import Intrinsics, check_transform, pose_from_vector, vecto
 from warpslam.complexity import flops_per_point, weight_count
 from warpslam.config import Config
 from warpslam.errors import CheckpointError, InputError
-from warpslam.kernels import adam, imap, losses, rays
+from warpslam.kernels import adam, density, imap, losses, rays
 from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth
 from warpslam.launching import Launcher, synchronize
 from warpslam.meshing import ObservedView, extract_mesh
@@ -409,7 +409,7 @@ class Imap(Baseline):
 def _compile(device: wp.Device) -> float:
     """Load the kernel modules that this method needs, and none of NICE-SLAM's decoders; the seconds it took."""
     start = time.perf_counter()
-    names = [module.__name__ for module in (adam, losses, rays)]
+    names = [module.__name__ for module in (adam, density, losses, rays)]
     for name in [*names, f"warpslam.imap_{'cuda' if device.is_cuda else 'cpu'}"]:
         wp.get_module(name).load(device)
     return time.perf_counter() - start

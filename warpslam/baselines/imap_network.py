@@ -11,7 +11,7 @@ import warp as wp
 from warpslam.complexity import imap_shapes
 from warpslam.decoders import EMBEDDING_SCALE
 from warpslam.field import RayBatch
-from warpslam.kernels import imap, rays
+from warpslam.kernels import density, imap, rays
 from warpslam.kernels.grid import Vec32
 from warpslam.launching import Launcher, Step, run_slices
 
@@ -157,25 +157,25 @@ class ImapBatch(RayBatch):
         wanted, tape: What to differentiate, and the tape that gets the adjoint; both or neither.
         empty_weight: Of |density| at the empty samples, whose adjoint is that of the sum over rays.
         """
-        kernels, samples = self.kernels_imap, self.sample_count
+        samples = self.sample_count
         corners = [bound.low, bound.high, self.origin, self.direction]
 
         def steps(first: int, stop: int, slot: int) -> list[Step]:
             ray_count = stop - first
             inputs = [first, self.seeds, self.iteration, int(jitter), self.stratified, samples, int(use_depth)]
             inputs += [self.measured_depth, self.t_exit, self.max_depth, self.z]
-            result: list[Step] = [(kernels.place_stratified, ray_count, inputs)]
+            result: list[Step] = [(density.place_stratified, ray_count, inputs)]
             if self.empty:
                 inputs = [first, self.seeds, self.iteration, self.visible, self.empty, samples]
-                result.append((kernels.place_empty, ray_count, [*inputs, self.measured_depth, self.z]))
+                result.append((density.place_empty, ray_count, [*inputs, self.measured_depth, self.z]))
             result += self._forward(network, first, stop, 0, self.stratified)
             inputs = [first, self.stratified, self.importance, samples, self.keep, *corners]
             inputs += [self.density, self.weight, self.z, self.order]
-            result.append((kernels.place_importance, ray_count, inputs))
+            result.append((density.place_importance, ray_count, inputs))
             result += self._forward(network, first, stop, self.stratified, samples - self.stratified)
             inputs = [first, self.visible, samples, self.keep, *corners, self.z, self.order, self.density, self.color]
             inputs += [self.weight, self.in_front, self.depth, self.variance, self.rgb]
-            result.append((kernels.composite, ray_count, inputs))
+            result.append((density.composite, ray_count, inputs))
             return result
 
         self.launcher.slices(self.count, steps)
@@ -187,7 +187,7 @@ class ImapBatch(RayBatch):
     def add_empty_loss(self, empty_weight: float) -> None:
         """Add the sum of ``empty_weight`` |density| over the empty samples to `loss`."""
         inputs = [self.visible, self.sample_count, empty_weight, self.keep, self.density, self.loss]
-        self.launcher.launch(self.kernels_imap.empty_loss, self.count, inputs)
+        self.launcher.launch(density.empty_loss, self.count, inputs)
 
     def query_points(self, network: ImapNetwork, points: np.ndarray) -> None:
         """Density and colour at points (N, 3) in network units; needs a batch of one sample a ray."""
@@ -217,7 +217,7 @@ class ImapBatch(RayBatch):
         span = [start, end, _CHUNK, slot]
         inputs = [first, self.visible, samples, self.keep, bound.low, bound.high, *points, self.order, self.density]
         inputs += [self.color, self.weight, self.in_front, self.depth.grad, self.rgb.grad, empty_weight]
-        result: list[Step] = [(kernels.composite_backward, stop - first, [*inputs, self.logit_grad, self.color_grad])]
+        result: list[Step] = [(density.composite_backward, stop - first, [*inputs, self.logit_grad, self.color_grad])]
         d, other = self._d
         inputs = [start, W, self.layers[-1], self.color_grad, self.logit_grad, d]
         result.append((kernels.output_backward, count, inputs))
