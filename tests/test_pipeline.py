@@ -296,3 +296,32 @@ def test_missing_pieces_of_a_run_are_named(tmp_path):
         folder.require(folder.map, "the run stopped before it had a map")
     with pytest.raises(MeshError, match="metrics.json"):
         pipeline.load_mesh(folder.metrics)
+
+
+def test_given_poses_replace_those_of_the_sequence(fake_slam, tmp_path):
+    """The method is given the file's poses, nearest in time; frames without one are left out; truth stays truth."""
+    from warpslam.evaluation import write_tum
+
+    given = np.tile(np.eye(4), (3, 1, 1))
+    given[:, 2, 3] = [1.0, 2.0, 3.0]
+    write_tum(tmp_path / "given.tum", np.array([0, 1, 3]) / 30 + 0.001, given)
+    result = pipeline.run(FakeSequence(4), Config(), tmp_path / "run", poses=tmp_path / "given.tum")
+    np.testing.assert_allclose([T[2, 3] for T in fake_slam.made[-1].given], [1.0, 2.0, 3.0])
+    assert result.metrics["frames"]["unreadable"] == 1
+    assert "frame 2 left out" in result.folder.log.read_text()
+    np.testing.assert_allclose(read_tum(result.folder.ground_truth)[1][2], true_pose(3), atol=1e-8)
+    with pytest.raises(DatasetError, match="none.tum"):
+        pipeline.run(FakeSequence(4), Config(), tmp_path / "run", poses=tmp_path / "none.tum")
+
+
+def test_metrics_name_the_method_and_its_map(fake_slam, tmp_path):
+    """Memory and cost of the map are in metrics.json, with the method that made it."""
+    metrics = pipeline.run(FakeSequence(3), Config(), tmp_path).metrics
+    assert metrics["method"] == "nice-slam" and metrics["poses"] is None
+    assert metrics["map"] == {"bytes": 2_500_000, "flops_per_point": 102_598}
+
+
+def test_unknown_method(tmp_path):
+    """The message lists the methods."""
+    with pytest.raises(ConfigError, match="nice-slam, imap, tsdf"):
+        pipeline.run(FakeSequence(3), Config(), tmp_path, method="orb")

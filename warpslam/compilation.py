@@ -23,6 +23,8 @@ _STAGES = ("gauss_newton", "rays", "adam", "compositing", "losses", "grid", "fru
 _PYTHON_MODULES = {
     "warpslam.decoder_cpu": "warpslam.kernels.decoder",
     "warpslam.decoder_cuda": "warpslam.kernels.decoder",
+    "warpslam.imap_cpu": "warpslam.kernels.imap",
+    "warpslam.imap_cuda": "warpslam.kernels.imap",
 }
 _WORKERS = 2
 _BINARIES = {"cpu": (".o",), "cuda": (".ptx", ".cubin")}

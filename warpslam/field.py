@@ -292,8 +292,12 @@ class RayBatch:
 
     def bound(self, arrays: FieldArrays, *, use_depth: bool = True) -> None:
         """Exit distances and the rays to keep (a measured surface outside the bound drops its ray)."""
+        self.bound_to(arrays.low, arrays.high, use_depth=use_depth)
+
+    def bound_to(self, low: wp.vec3, high: wp.vec3, *, use_depth: bool = True) -> None:
+        """`bound` for the box between two corners."""
         self.launcher.call(self.max_depth.zero_)
-        inputs = [arrays.low, arrays.high, self.origin, self.direction, self.measured_depth, int(use_depth)]
+        inputs = [low, high, self.origin, self.direction, self.measured_depth, int(use_depth)]
         self.launcher.launch(rays.bound_rays, self.count, [*inputs, self.t_exit, self.keep, self.max_depth])
 
     def place_samples(self, stratified: int, surface: int, *, use_depth: bool = True, jitter: bool = False) -> None:

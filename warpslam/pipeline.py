@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,14 +23,17 @@ from warpslam.evaluation import (
     AteResult,
     ReconstructionResult,
     Statistics,
+    associate,
     ate,
     cull_mesh,
     depth_l1,
     evaluate_reconstruction,
+    read_tum,
     rpe,
     write_tum,
 )
-from warpslam.run_folder import RunFolder, Source, write_json
+from warpslam.method import DEFAULT_METHOD, build_method, load_method
+from warpslam.run_folder import RunFolder, Source, read_json, write_json
 
 if TYPE_CHECKING:
     import trimesh
@@ -37,9 +41,11 @@ if TYPE_CHECKING:
     from warpslam.camera import Intrinsics
     from warpslam.compilation import ModuleProgress
     from warpslam.config import Config
+    from warpslam.method import Method
     from warpslam.plots import Panel
     from warpslam.sequences.base import Frame, RgbdSequence
-    from warpslam.slam import FrameResult, Slam, Trajectory
+    from warpslam.slam import FrameResult
+    from warpslam.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
@@ -92,6 +98,8 @@ def run(
     truth_mesh: trimesh.Trimesh | None = None,
     on_frame: Callable[[Progress], None] | None = None,
     on_module: Callable[[ModuleProgress], None] | None = None,
+    method: str = DEFAULT_METHOD,
+    poses: str | Path | None = None,
 ) -> RunResult:
     """Run SLAM over a sequence and write a run folder.
 
@@ -106,6 +114,9 @@ def run(
         truth_mesh: True surface in the world frame of the sequence; adds the reconstruction metrics.
         on_frame: Called after each frame.
         on_module: Called before and after each module of kernels is loaded, or compiled if it never was.
+        method: One of `warpslam.method.METHODS`.
+        poses: Trajectory in the TUM format whose poses are given to the method in place of the sequence's own; frames
+            without one are left out. Errors are against the sequence's own as ever.
 
     Raises:
         WarpSlamError: The input or a setting can't be used. metrics.json is written even so.
@@ -113,8 +124,10 @@ def run(
     selected = select_frames(sequence, frames)
     folder = RunFolder.create(output, sequence.name)
     with _log_file(folder.log):
-        run_ = _Run(sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame, on_module)
-        return run_.execute()
+        given = None if poses is None else GivenPoses.read(poses)
+        return _Run(
+            sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame, on_module, method, given
+        ).execute()
 
 
 class _Run:
@@ -130,12 +143,15 @@ class _Run:
         truth_mesh: trimesh.Trimesh | None,
         on_frame: Callable[[Progress], None] | None,
         on_module: Callable[[ModuleProgress], None] | None,
+        method: str,
+        given: GivenPoses | None,
     ) -> None:
+        self.method, self.given = method, given
         self.sequence, self.config, self.folder, self.selected = sequence, config, folder, selected
         self.device, self.seed, self.source, self.truth_mesh, self.on_frame = device, seed, source, truth_mesh, on_frame
         self.on_module = on_module
         self.modules: list[ModuleProgress] = []
-        self.slam: Slam | None = None
+        self.slam: Method | None = None
         self.status = "finished"
         self.started = datetime.now().astimezone()
         self.frame_indices: list[int] = []
@@ -194,7 +210,8 @@ class _Run:
         with self._clock("setup"):
             with self._clock("kernel_compile"):
                 self.modules = load_kernels(self.sequence, self.device, self.on_module)
-            self.slam = build_slam(self.sequence.intrinsics, self.config, self.device, self.seed)
+            build = build_slam if self.method == DEFAULT_METHOD else partial(build_baseline, self.method)
+            self.slam = build(self.sequence.intrinsics, self.config, self.device, self.seed)
         self.seconds["kernel_compile"] += self.slam.compile_seconds
 
     def _process_frames(self) -> None:
@@ -207,9 +224,8 @@ class _Run:
                     T_world_camera = None
                 self.frame_indices.append(frame.index)
                 self.truth_poses.append(np.full((4, 4), np.nan) if T_world_camera is None else T_world_camera)
-                result = self.slam.step(
-                    frame.rgb, frame.depth, timestamp=frame.timestamp, T_world_camera=T_world_camera
-                )
+                given = T_world_camera if self.given is None else self.given.at(frame.timestamp)
+                result = self.slam.step(frame.rgb, frame.depth, timestamp=frame.timestamp, T_world_camera=given)
                 self.results.append(result)
                 level = logging.INFO if result.status == "OK" else logging.WARNING
                 log.log(level, "frame %d: %s", frame.index, _describe(result))
@@ -227,6 +243,12 @@ class _Run:
                 self.unreadable_count += 1
                 self.left_out.append({"index": index, "message": str(error)})
                 log.warning("frame %d left out: %s", index, error)
+                continue
+            if self.given is not None and self.given.at(frame.timestamp) is None:
+                self.unreadable_count += 1
+                message = f"{self.given.path} has no pose for {frame.timestamp:.3f} s"
+                self.left_out.append({"index": index, "message": message})
+                log.warning("frame %d left out: %s", index, message)
                 continue
             yield frame
 
@@ -275,6 +297,7 @@ class _Run:
         assert self.slam is not None
         with self._clock("saving"):
             self.slam.save(self.folder.map)
+        self.metrics["map"] = {"bytes": self.slam.map_bytes, "flops_per_point": self.slam.flops_per_point}
 
     def _describe_map(self) -> None:
         from warpslam.inventory import take_inventory
@@ -416,6 +439,8 @@ class _Run:
         self.metrics = {
             "warpslam": __version__,
             "sequence": self.sequence.name,
+            "method": self.method,
+            "poses": None if self.given is None else self.given.path,
             "status": self.status,
             "device": str(self.slam.device) if self.slam is not None else self.device,
             "seed": self.seed,
@@ -468,32 +493,59 @@ def load_kernels(
     return compile_kernels(wp.get_device(device), report, getattr(sequence, "warp_modules", ()))
 
 
-def build_slam(intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Slam:
+@dataclass(frozen=True)
+class GivenPoses:
+    """Poses that a file gives to frames, by time.
+
+    path: File. times: [s], shape (N,). poses: T_world_camera, shape (N, 4, 4).
+    """
+
+    path: Path
+    times: np.ndarray
+    poses: np.ndarray
+
+    @classmethod
+    def read(cls, path: str | Path) -> GivenPoses:
+        """Read a trajectory in the TUM format, such as an earlier run's trajectory.tum.
+
+        Raises:
+            DatasetError: The file can't be read.
+        """
+        return cls(Path(path), *read_tum(path))
+
+    def at(self, timestamp: float) -> np.ndarray | None:
+        """The pose nearest in time, within 20 ms; None if there is none."""
+        position = int(associate(np.array([timestamp]), self.times)[0])
+        return None if position < 0 else self.poses[position]
+
+
+def build_slam(intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Method:
     """The SLAM object of a run.
 
     Raises:
         ConfigError: There is no such device.
         CheckpointError: The decoders can't be loaded.
     """
-    from warpslam.slam import Slam
+    return build_baseline(DEFAULT_METHOD, intrinsics, config, device, seed)
 
+
+def build_baseline(method: str, intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Method:
+    """Any method of a run, by name; see `warpslam.method.build_method` for what it raises."""
     check_device(device)
-    return Slam(intrinsics, config=config, device=device, seed=seed)
+    return build_method(method, intrinsics, config, device, seed)
 
 
-def load_slam(folder: RunFolder, device: str | None = None) -> Slam:
-    """The SLAM object as a run left it.
+def load_slam(folder: RunFolder, device: str | None = None) -> Method:
+    """The SLAM object (or the baseline) as a run left it.
 
     Raises:
         ConfigError: There is no such device.
         DatasetError: The run saved no map.
         CheckpointError: The map can't be loaded.
     """
-    from warpslam.slam import Slam
-
     path = folder.require(folder.map, "the run stopped before it had a map")
     check_device(device)
-    return Slam.load(path, device=device)
+    return load_method(read_json(folder.metrics).get("method", DEFAULT_METHOD), path, device)
 
 
 def check_device(device: str | None) -> None:
@@ -509,7 +561,7 @@ def check_device(device: str | None) -> None:
         raise ConfigError(f"device {device!r} is not there; this machine has {', '.join(names)}")
 
 
-def render_panel(slam: Slam, frame: Frame, T_world_camera: np.ndarray, stride: int = 1) -> Panel:
+def render_panel(slam: Method, frame: Frame, T_world_camera: np.ndarray, stride: int = 1) -> Panel:
     """A frame beside what the map renders from ``T_world_camera`` (4, 4), every ``stride``-th pixel of both."""
     from warpslam.plots import Panel
 

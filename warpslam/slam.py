@@ -12,9 +12,11 @@ import warp as wp
 
 from warpslam.camera import Intrinsics, check_transform, pose_from_vector, vector_from_pose
 from warpslam.compilation import compile_kernels
+from warpslam.complexity import field_flops, weight_count
 from warpslam.config import Config
 from warpslam.decoders import Decoders, load_decoders
 from warpslam.errors import InputError
+from warpslam.images import read_images
 from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth
 from warpslam.launching import synchronize
 from warpslam.mapper import Mapper
@@ -129,7 +131,7 @@ class Slam:
         """
         index = len(self._vectors)
         timestamp = index / 30.0 if timestamp is None else float(timestamp)
-        rgb, depth = self._read_images(rgb, depth, depth_scale)
+        rgb, depth = read_images(rgb, depth, self.intrinsics, self.config.grid.max_depth, depth_scale)
         given = None if T_world_camera is None else check_transform(T_world_camera)
         if self.config.tracking.use_given_poses and given is None:
             raise InputError(f"frame {index}: tracking.use_given_poses is on, but step() got no T_world_camera")
@@ -292,6 +294,18 @@ class Slam:
             min_component_area=config.min_component_area,
         )
 
+    @property
+    def map_bytes(self) -> int:
+        """Memory of the grids' features and of the decoders, without optimiser state and images [bytes]."""
+        rows = sum(grid.row_count for grid in self.scene.grids.values())
+        weights = sum(weight_count(decoder.level, decoder.hidden) for decoder in self.scene.decoder_weights)
+        return 4 * (32 * rows + weights)
+
+    @property
+    def flops_per_point(self) -> int:
+        """Operations of the field at a point, forward (see `warpslam.complexity`)."""
+        return field_flops({decoder.level: decoder.hidden for decoder in self.scene.decoder_weights})["field"]
+
     def save(self, path: str | Path) -> None:
         """Write map, keyframes, trajectory and settings to one .npz file (no pickled code)."""
         from warpslam.checkpoint import save_slam
@@ -321,28 +335,6 @@ class Slam:
         self._append(vector, timestamp, "SKIPPED")
         return FrameResult(index, timestamp, pose_from_vector(vector), "SKIPPED", inliers=0.0, message=message)
 
-    def _read_images(self, rgb: Any, depth: Any, depth_scale: float | None) -> tuple[np.ndarray, np.ndarray]:
-        """uint8 (H, W, 3) and float32 (H, W) [m] with 0 for everything that is no measurement."""
-        rgb, depth = _to_numpy(rgb), _to_numpy(depth)
-        size = (self.intrinsics.height, self.intrinsics.width)
-        if rgb.shape != (*size, 3):
-            raise InputError(f"rgb has shape {rgb.shape}, expected {(*size, 3)} from the intrinsics")
-        if depth.shape != size:
-            raise InputError(f"depth has shape {depth.shape}, expected {size} from the intrinsics")
-        if np.issubdtype(rgb.dtype, np.floating):
-            rgb = np.rint(np.clip(np.nan_to_num(rgb), 0.0, 1.0) * 255.0).astype(np.uint8)
-        elif rgb.dtype != np.uint8:
-            raise InputError(f"rgb has dtype {rgb.dtype}, expected uint8 or float in [0, 1]")
-        if np.issubdtype(depth.dtype, np.integer):
-            if depth_scale is None or not depth_scale > 0:
-                raise InputError(f"depth is {depth.dtype}: pass depth_scale, the units per metre (for example 1000)")
-            depth = depth / np.float32(depth_scale)
-        elif not np.issubdtype(depth.dtype, np.floating):
-            raise InputError(f"depth has dtype {depth.dtype}, expected float [m] or uint16 with depth_scale")
-        depth = depth.astype(np.float32)
-        usable = np.isfinite(depth) & (depth > 0) & (depth <= self.config.grid.max_depth)
-        return rgb, np.where(usable, depth, np.float32(0.0))
-
 
 class _timed:
     """Adds the wall-clock seconds of a block to ``timings[name]``; the block is a phase for the profiler."""
@@ -359,16 +351,6 @@ class _timed:
         synchronize(self.device)
         self.timings[self.name] = self.timings.get(self.name, 0.0) + time.perf_counter() - self.start
         self.phase.__exit__()
-
-
-def _to_numpy(array: Any) -> np.ndarray:
-    if isinstance(array, np.ndarray):
-        return array
-    if isinstance(array, wp.array):
-        return array.numpy()
-    if hasattr(array, "detach"):
-        return array.detach().cpu().numpy()
-    raise InputError(f"expected a NumPy, torch or Warp array, got {type(array).__name__}")
 
 
 def _check_image_size(camera: Intrinsics, config: Config) -> None:

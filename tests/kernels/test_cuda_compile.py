@@ -18,23 +18,21 @@ sys.path.append(str(Path(__file__).resolve().parents[2] / "tools"))
 from cuda_registers import REGISTER_LIMIT, KernelResources, compiled_cubin, markdown_table, read_cubin  # noqa: E402
 
 ARCHITECTURES = (80, 90)
-DECODER = "warpslam.decoder_cuda"
 # Bytes that may be spilled, and why they are.
-SPILLING = {
-    "color_backward": (2048, "holds the gradients of all five layers until they are stored, 320 numbers"),
-    "color_weights": (4096, "one kernel sums every kind of row; few threads of it run, and rarely"),
-}
+SPILLING = {"color_backward": (16, "holds the gradients of two layers for the weights of the embedding")}
+BUILT = {"warpslam.decoder_cuda": "warpslam.kernels.decoder", "warpslam.imap_cuda": "warpslam.kernels.imap"}
+"""Warp modules that a function builds, and the Python modules that call it."""
 
 
 def kernel_modules() -> list[str]:
-    """Names of the Warp modules that hold kernels; those of the decoders are built by a function, in their own."""
+    """Names of the Warp modules that hold kernels, those that a function builds included."""
     root = Path(warpslam.__file__).parent
     names = [
         ".".join(("warpslam", *path.relative_to(root).with_suffix("").parts))
         for path in sorted(root.rglob("*.py"))
         if re.search(r"^@wp\.kernel", path.read_text(), re.MULTILINE)
     ]
-    return [*names, DECODER]
+    return [*names, *BUILT]
 
 
 def test_every_kernel_module_is_found():

@@ -19,6 +19,7 @@ from warpslam.cli.common import (
     quiet_warp,
     warnings_on_stderr,
 )
+from warpslam.method import DEFAULT_METHOD, METHODS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -38,10 +39,19 @@ def add(commands: Any) -> None:
     run.add_argument("folder", metavar="FOLDER", help="folder of one sequence")
     add_sequence_options(run)
     run.add_argument("--truth-mesh", metavar="FILE", help="true surface, for the reconstruction metrics")
+    _add_method_options(run)
     add_run_options(run)
 
     demo = add_command(commands, "demo", _demo, "SLAM in a small rendered room; needs no data")
+    _add_method_options(demo)
     add_run_options(demo)
+
+
+def _add_method_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--method", choices=METHODS, default=DEFAULT_METHOD, help=f"what runs ({DEFAULT_METHOD})")
+    parser.add_argument(
+        "--poses", metavar="FILE", help="take the poses of this TUM trajectory, such as an earlier run's, as given"
+    )
 
 
 def _run(options: argparse.Namespace) -> int:
@@ -77,6 +87,9 @@ def _execute(
 
     if options.decoders:
         config = config.model_copy(update={"decoders": options.decoders})
+    if options.poses:
+        tracking = config.tracking.model_copy(update={"use_given_poses": True})
+        config = config.model_copy(update={"tracking": tracking})
     with warnings_on_stderr(), _progress(sequence.name) as (on_frame, on_module):
         result = run(
             sequence,
@@ -87,6 +100,8 @@ def _execute(
             source=source,
             on_frame=on_frame,
             on_module=on_module,
+            method=options.method,
+            poses=options.poses,
             **keywords,
         )
     _print_summary(result)
@@ -166,6 +181,11 @@ def _print_summary(result: RunResult) -> None:
         unaligned = metrics["ate_m"]["unaligned"]["rmse"]
         print(f"ATE RMSE    {100 * result.ate.rmse:.2f} cm aligned, {100 * unaligned:.2f} cm unaligned")
     mesh = metrics.get("mesh", {})
+    size = metrics.get("map")
+    if size:
+        flops = size["flops_per_point"]
+        cost = f", {flops:,} FLOP a point" if flops is not None else ""
+        print(f"map         {size['bytes'] / 1e6:.2f} MB{cost}")
     if "faces" in mesh:
         print(f"mesh        {mesh['vertices']} vertices, {mesh['faces']} faces")
     if result.reconstruction is not None:

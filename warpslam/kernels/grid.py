@@ -88,15 +88,20 @@ def interpolate(features: wp.array(dtype=Vec32), lattice: Lattice, cell: Cell) -
 
 
 @wp.func
-def dot32(a: Vec32, b: Vec32) -> float:
+def sum32(a: Vec32) -> float:
     # Halves are added to one another: `wp.dot` is one serial chain of 32 additions on the CPU backend.
     s = Vec16()
     for i in range(16):
-        s[i] = a[i] * b[i] + a[i + 16] * b[i + 16]
+        s[i] = a[i] + a[i + 16]
     t = wp.vec4()
     for i in range(4):
         t[i] = (s[i] + s[i + 4]) + (s[i + 8] + s[i + 12])
     return (t[0] + t[2]) + (t[1] + t[3])
+
+
+@wp.func
+def dot32(a: Vec32, b: Vec32) -> float:
+    return sum32(wp.cw_mul(a, b))
 
 
 @wp.func

@@ -46,7 +46,11 @@ class RenderedSequence(RgbdSequence):
         rgb, depth = self._renderer.render(self._poses[index])
         if self.noise_seed is not None:
             depth = sensor_noise(depth, np.random.default_rng((self.noise_seed, index)), self.intrinsics)
-        return Frame(index, index / FRAME_RATE, rgb, depth, self._poses[index].copy())
+        return Frame(index, self.timestamp(index), rgb, depth, self._poses[index].copy())
+
+    def timestamp(self, index: int) -> float:
+        """Time of a frame [s]."""
+        return index / FRAME_RATE
 
     def ground_truth(self) -> np.ndarray:
         """All poses, float64, shape (N, 4, 4)."""
