@@ -1,6 +1,7 @@
-"""Pretrain the decoders on procedural rooms (supplement A.5): `train`, `evaluate`, `export`.
+"""Pretrain the decoders on procedural rooms (supplement A.5): `train`, `quiet`, `evaluate`, `export`.
 
     python tools/pretrain_decoders.py train --out runs/pretraining --minutes 20
+    python tools/pretrain_decoders.py quiet --out runs/quiet --start runs/pretraining/decoders.pth
     python tools/pretrain_decoders.py evaluate --out runs/pretraining --also other=some_decoders.pth
     python tools/pretrain_decoders.py export --out runs/pretraining --to warpslam/data/decoders.pth
 
@@ -25,6 +26,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from pretraining import evaluation  # noqa: E402
+from pretraining.quiet import quiet_fine_decoder  # noqa: E402
 from pretraining.room_samples import HELD_OUT_SEED, SampleSizes, load_room, prepare_rooms  # noqa: E402
 from pretraining.training import Trainer, TrainingConfig  # noqa: E402
 from rich.console import Console  # noqa: E402
@@ -98,6 +100,16 @@ def evaluate(options: argparse.Namespace) -> int:
     (out / "evaluation.json").write_text(json.dumps(result, indent=1))
     (out / "evaluation.md").write_text(evaluation.table(result) + "\n")
     report(evaluation.table(result))
+    return 0
+
+
+def quiet(options: argparse.Namespace) -> int:
+    """Make the fine decoder silent at zero feature, from decoders in a file; writes decoders.pth."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    report = _logger(options.out / "log.txt")
+    rooms = _rooms(options, range(options.rooms), report)
+    weights = quiet_fine_decoder(load_decoders(options.start), rooms, options.steps, report, seed=options.seed)
+    weights.save(options.out / "decoders.pth")
     return 0
 
 
@@ -204,6 +216,12 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--budgets", type=int, nargs="+", default=[10, 30, 60, 120], help="mapping iterations")
     command.add_argument("--seed", type=int, default=0, help="seed of the random decoders")
     command.set_defaults(run=evaluate)
+    command = commands.add_parser("quiet", parents=[shared], help="silence the fine decoder at zero feature")
+    command.add_argument("--start", type=Path, required=True, help="decoders to start from")
+    command.add_argument("--rooms", type=int, default=12, help="training rooms that are mapped for features")
+    command.add_argument("--steps", type=int, default=8000, help="Adam steps")
+    command.add_argument("--seed", type=int, default=0, help="seed of the draws")
+    command.set_defaults(run=quiet)
     command = commands.add_parser("export", parents=[shared], help="write the package's file")
     command.add_argument("--coarse-from", type=Path, help="take the coarse decoder from this file")
     command.add_argument("--to", type=Path, default=ROOT / "warpslam" / "data" / "decoders.pth")
