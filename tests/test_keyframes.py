@@ -72,7 +72,7 @@ def test_pool_says_what_it_needs():
 
 
 def test_compact_images_are_smaller_and_exact():
-    """Smooth images shrink to less than a third; what does not hold an image is refused, however much it inflates to."""
+    """Smooth images shrink to less than a third; what does not hold an image is refused, whatever it inflates to."""
     v, u = np.mgrid[:120, :160]
     rgb = np.stack([u, v, u + v], -1).astype(np.uint8)
     image = CompactImage.of(rgb, (100 * v + u).astype(np.uint16), 0.001)

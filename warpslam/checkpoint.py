@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,7 +66,7 @@ def slam_state(slam: Slam) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         "depth_errors": np.array(slam._depth_errors, np.float64),
         "bounds": np.stack(slam.scene.bounds),
         "keyframe_poses": np.array([keyframe.pose for keyframe in slam.keyframes], np.float64).reshape(-1, 7),
-        "seen": np.array([seen.millimetres for seen in slam._seen], np.uint16).reshape(-1, *_seen_size(slam.intrinsics)),
+        "seen": np.array([s.millimetres for s in slam._seen], np.uint16).reshape(-1, *_seen_size(slam.intrinsics)),
         "current_rgb": rgb,
         "current_depth": depth,
         "image_scales": np.array([scale, *(image.scale for image in images)], np.float64),
@@ -153,6 +154,11 @@ def slam_from_state(
         )
         for n in range(len(frames))
     ]
+    for n, image in enumerate(images):
+        try:
+            image.unpack(camera)
+        except (ValueError, zlib.error) as error:
+            raise state.damaged(f"image_{n}", error) from None
     rgb, depth = state.array("current_rgb", np.uint8, (*size, 3)), state.array("current_depth", np.uint16, size)
     slam._images.restore((rgb, depth, scales[0]), images)
     poses = state.array("keyframe_poses", np.float64, (len(frames), 7)).copy()
@@ -177,8 +183,8 @@ class _Fields:
         array = self.arrays.get(name)
         if array is None:
             raise self.damaged(name, "it is not there")
-        fits = len(array.shape) == len(shape) and all(w is None or w == n for w, n in zip(shape, array.shape, strict=True))
-        if array.dtype != dtype or not fits:
+        wanted = tuple(n if size is None else size for size, n in zip(shape, array.shape, strict=False))
+        if array.dtype != dtype or len(array.shape) != len(shape) or array.shape != wanted:
             expected = f"{np.dtype(dtype)} {tuple('any' if n is None else n for n in shape)}"
             raise self.damaged(name, f"it is {array.dtype} {array.shape}, expected {expected}")
         if array.dtype.kind == "f" and not np.isfinite(array).all():

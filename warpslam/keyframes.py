@@ -125,8 +125,8 @@ def check_window_fits(camera: Intrinsics, max_gigabytes: float, window: int) -> 
 def _too_many_images(camera: Intrinsics, needed: int, slots: int) -> str:
     gigabytes = 5 * camera.height * camera.width / 1e9
     return (
-        f"mapping needs {needed} images of {camera.width} x {camera.height} at a time, {needed * gigabytes:.4f} GB, and "
-        f"keyframes.max_gigabytes has room for {slots}: raise it, or lower mapping.window"
+        f"mapping needs {needed} images of {camera.width} x {camera.height} at a time, {needed * gigabytes:.4f} GB, "
+        f"and keyframes.max_gigabytes has room for {slots}: raise it, or lower mapping.window"
     )
 
 

@@ -66,8 +66,8 @@ class Track:
         last = self.last
         if last is None:
             return False
-        recent = np.array([self._step(n - 1, n) for n in self._recent() if n > self.first and self.status[n - 1] == "OK"])
-        usual = STEP_FACTOR * np.median(recent, axis=0) if len(recent) else np.zeros(2)
+        recent = [self._step(n - 1, n) for n in self._recent() if n > self.first and self.status[n - 1] == "OK"]
+        usual = STEP_FACTOR * np.median(recent, axis=0) if recent else np.zeros(2)
         elapsed = len(self.status) - last
         step = motion_between(pose_from_vector(self.vectors[last]), T_world_camera)
         return bool((np.array(step) > elapsed * np.maximum(usual, [max_step, max_turn])).any())
