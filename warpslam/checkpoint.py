@@ -43,6 +43,16 @@ def load_slam(
     return slam
 
 
+def saved_config(path: Path) -> Config:
+    """Settings of a saved map.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, or of another version.
+    """
+    header, arrays = read_state(path, MAP_FORMAT)
+    return _config(_Fields(str(path), header, arrays))
+
+
 def slam_state(slam: Slam) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays; on the CPU the large ones are views of the map, not copies."""
     header = {
@@ -108,7 +118,7 @@ def slam_from_state(
     from warpslam.slam import Slam
 
     state = _Fields(source, header, arrays)
-    saved = Config.from_dict(state.mapping("config"), source=f"{source}: config")
+    saved = _config(state)
     if config is not None:
         _check_same_map(source, saved, config)
     # A copy, because the caller's settings are not ours to change.
@@ -216,6 +226,13 @@ class _Fields:
         if type(index) is not int or not 0 <= index < count:
             raise self.damaged(name, f"{index!r} is none of the {count} frames")
         return index
+
+
+def _config(state: _Fields) -> Config:
+    try:
+        return Config.from_dict(state.mapping("config"))
+    except ConfigError as error:
+        raise state.damaged("config", error) from None
 
 
 def _seen_size(camera: Intrinsics) -> tuple[int, int]:

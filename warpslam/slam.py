@@ -274,6 +274,12 @@ class Slam:
             min_component_area=config.min_component_area,
         )
 
+    def memory(self) -> dict[str, float | None]:
+        """Bytes of the map's state, in all and per observed cubic metre; see `warpslam.memory.memory_report`."""
+        from warpslam.memory import memory_report
+
+        return memory_report(self)
+
     def save(self, path: str | Path) -> None:
         """Write map, keyframes, trajectory and settings to one file (plain arrays, no code)."""
         from warpslam.checkpoint import save_slam
