@@ -167,6 +167,15 @@ def test_changed_settings_are_refused(stopped, capsys, options, message):
     assert {file.name: file.read_bytes() for file in stopped.iterdir()} == before
 
 
+def test_memory_budget_may_change(stopped, uninterrupted, tmp_path):
+    """A run that ran out of its budget goes on with a larger one, to the same trajectory and mesh."""
+    folder = copy(stopped, tmp_path / "run")
+    assert cli.main(["run", "--resume", str(folder), "--set", "grid.max_gigabytes=9", "keyframes.max_gigabytes=1"]) == 0
+    for name in ("trajectory.tum", "mesh.ply"):
+        assert (folder / name).read_bytes() == (uninterrupted / name).read_bytes()
+    assert "max_gigabytes: 9.0" in (folder / "config.yaml").read_text()
+
+
 def test_changed_input_is_refused(stopped, recording, capsys):
     """A frame that the run has used was replaced: refused by its number."""
     first, other = (recording / "results" / f"depth{n:06d}.png" for n in (0, 9))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,6 +16,17 @@ if TYPE_CHECKING:
     from warpslam.slam import Slam
 
 VIEW_COUNT = 200
+
+
+def free_gigabytes(device: wp.Device) -> float | None:
+    """Memory of a device, or of the machine for the CPU, that is not in use [GB]; None where that can't be told."""
+    if device.is_cuda:
+        return device.free_memory / 1e9
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")) * 1024 / 1e9
+    except (OSError, StopIteration, IndexError, ValueError):  # not Linux
+        return None
 
 
 def memory_report(slam: Slam) -> dict[str, float | None]:

@@ -242,7 +242,7 @@ class _Run:
         request = self.request
         with self._clock("setup"):
             if self.saved is not None:
-                self.slam = self.saved.slam()
+                self.slam = self.saved.slam(self.config)
                 log.info("resumed from %s, after %d frames", self.saved.path, self.position)
             elif request is not None and request.map is not None:
                 self.slam = open_map(

@@ -1,9 +1,9 @@
 """Where the camera is when tracking alone does not tell: failure is noticed, and the pose found again.
 
 A tracked pose is trusted if the map explains the depth (residual, inliers) and the step to it is one the camera may
-have made. Otherwise the frame is tracked with more rays and iterations from where the camera was last, and then from
-the keyframes that look most like it. A pose found that way may be anywhere, so it has to explain the frame as well as
-tracked frames are explained; if none does, the frame is lost.
+have made. Otherwise the frame is tracked with more iterations from where the camera was last, then from the keyframes
+that look most like it, and with more rays, too, from the best of these. A pose found that way may be anywhere, so it
+has to explain the frame as well as tracked frames are explained; if none does, the frame is lost.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from warpslam.tracker import Tracker, TrackingResult
 RECENT_FRAMES = 20
 STEP_FACTOR = 5.0  # a step beyond this multiple of the recent ones is a jump
 ERROR_FACTOR = 1.5  # a pose found again errs no more than this multiple of the recent depth errors
-PROMISING_FACTOR = 4.0  # a short optimisation this far above the limit is worth a long one
-SHORT_FACTOR = 3  # iterations of a short optimisation, as a multiple of those of tracking
+PROMISING_FACTOR = 4.0  # a pose whose depth error is this far above the limit is worth a long optimisation
+SHORT_FACTOR = 3  # iterations from each start and keyframe, as a multiple of those of tracking
 MIN_INLIERS = 0.6  # of a pose found again
 THUMBNAIL = (12, 16)  # rows, columns
 GREY_WEIGHT = 2.0  # how much a difference in grey, 0..1, counts beside a relative difference in depth
@@ -67,10 +67,11 @@ class Track:
         if last is None:
             return False
         recent = [self._step(n - 1, n) for n in self._recent() if n > self.first and self.status[n - 1] == "OK"]
-        usual = STEP_FACTOR * np.median(recent, axis=0) if recent else np.zeros(2)
+        # Before any step is known the camera may be a fast one.
+        usual = np.median(recent, axis=0) if recent else np.array([max_step, max_turn])
         elapsed = len(self.status) - last
         step = motion_between(pose_from_vector(self.vectors[last]), T_world_camera)
-        return bool((np.array(step) > elapsed * np.maximum(usual, [max_step, max_turn])).any())
+        return bool((np.array(step) > elapsed * np.maximum(STEP_FACTOR * usual, [max_step, max_turn])).any())
 
     def depth_error(self) -> float:
         """Median depth error of the recent frames [m], 0 if there are none."""
@@ -114,46 +115,38 @@ class Localizer:
         starts = track.starts(self.config.constant_speed)
         was_known = track.last is not None and track.last == len(track.status) - 1
         tried = [self.tracker.track(arrays, images, index, start) for start in starts[:1]]
+        if tried and (not self._why_lost(tried[0], track) if was_known else self._is_found(tried[0], track)):
+            return Located(tried[0], after_loss=not was_known)
+
+        # Longer, and from the last pose as well: the constant-speed guess may be what failed. Once the camera is lost
+        # it has moved on, and this does not pay any more.
         if was_known:
-            if not self._why_lost(tried[0], track):
-                return Located(tried[0])
-            # Harder, and from the last pose as well: the constant-speed guess may be what failed. Once the camera is
-            # lost it has moved on, and this does not pay any more.
-            effort = self.config.recovery_factor
-            tried += [self.tracker.track(arrays, images, index, start, effort=effort) for start in starts]
-            best = min(tried, key=lambda result: (bool(self._why_lost(result, track)), _badness(result)))
-            if not self._why_lost(best, track):
-                return Located(best)
-        elif tried and self._is_found(tried[0], track):
-            return Located(tried[0], after_loss=True)
-        if self.config.relocalization:
-            tried += self._search(arrays, images, index, track, keyframes)
-        if not tried:
+            tried += [self._track_longer(arrays, images, index, start) for start in starts]
+        best = min(tried, key=_badness, default=None)
+        if not (was_known and best is not None and not self._why_lost(best, track)) and self.config.relocalization:
+            likely = self._likely(images, keyframes)[: self.config.relocalization_keyframes]
+            poses = [pose_from_vector(keyframe.pose) for keyframe in likely]
+            tried += [self._track_longer(arrays, images, index, pose) for pose in poses]
+            best = min(tried, key=_badness, default=None)
+        if best is None:
             nowhere = TrackingResult(np.eye(4), np.inf, np.inf, 0.0)
             return Located(nowhere, "it is not known where the camera starts: there is no keyframe to compare with")
-        best = min(tried, key=_badness)
-        if self._is_found(best, track):
-            return Located(best, after_loss=True)
-        limit = self._limit(track)
-        why = f"mean depth error {best.depth_error:.2f} m, a pose found again needs less than {limit:.2f} m"
-        return Located(best, self._why_lost(best, track) or why)
 
-    def _search(
-        self, arrays: FieldArrays, images: ImagePool, index: int, track: Track, keyframes: Sequence[Keyframe]
-    ) -> list[TrackingResult]:
-        """A short optimisation from each of the likeliest keyframes, and a long one from the best if it is close."""
-        chosen = self._likely(images, keyframes)[: self.config.relocalization_keyframes]
-        results = [
-            self.tracker.track(arrays, images, index, pose_from_vector(keyframe.pose), iteration_factor=SHORT_FACTOR)
-            for keyframe in chosen
-        ]
-        if not results:
-            return []
-        best = min(results, key=_badness)
+        # The long optimisation is dear: once, and from a pose that it can be expected to mend.
         if best.depth_error < PROMISING_FACTOR * self._limit(track):
             effort = self.config.recovery_factor
-            results.append(self.tracker.track(arrays, images, index, best.T_world_camera, effort=effort))
-        return results
+            longest = self.tracker.track(arrays, images, index, best.T_world_camera, effort=effort)
+            best = min(best, longest, key=_badness)
+        why = self._why_lost(best, track)
+        if was_known and not why:
+            return Located(best)
+        if self._is_found(best, track):
+            return Located(best, after_loss=True)
+        after = f"mean depth error {best.depth_error:.2f} m, {self._limit(track):.2f} m is the limit after a loss"
+        return Located(best, why or after)
+
+    def _track_longer(self, arrays: FieldArrays, images: ImagePool, index: int, start: np.ndarray) -> TrackingResult:
+        return self.tracker.track(arrays, images, index, start, iteration_factor=SHORT_FACTOR)
 
     def _likely(self, images: ImagePool, keyframes: Sequence[Keyframe]) -> list[Keyframe]:
         """Keyframes by the likeness of their images to the current one."""

@@ -26,12 +26,15 @@ if TYPE_CHECKING:
 
 RUN_FORMAT = StateFormat("warpslam-run", 1)
 
+# Room for more changes no result, and a run that ran out of it is one to resume.
+_FREE_TO_CHANGE = ("config.grid.max_gigabytes", "config.keyframes.max_gigabytes")
+
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What a run was asked for; a resumed run must be asked for the same.
+    """What a run was asked for; a resumed run must be asked for the same (but for the memory it may take).
 
     sequence: Name of the input. frame_count: Frames it has. intrinsics: Its camera, by field. frames: Start, stop and
     step of those used. config: All settings. seed: Of every random choice. device: Where it runs. map: Map it started
@@ -54,7 +57,7 @@ class RunRequest:
         mine, theirs = (dict(_leaves(dataclasses.asdict(request))) for request in (self, other))
         lines = []
         for name in sorted(mine.keys() | theirs.keys()):
-            if mine.get(name) != theirs.get(name):
+            if name not in _FREE_TO_CHANGE and mine.get(name) != theirs.get(name):
                 lines.append(f"{name} is {theirs.get(name)!r}, was {mine.get(name)!r}")
         return lines
 
@@ -99,8 +102,8 @@ class SavedRun:
             raise CheckpointError(f"{self.path}: does not say how to open the input; resume it from Python")
         return Source(**self.request.source)
 
-    def slam(self) -> Slam:
-        """The SLAM object as it was.
+    def slam(self, config: Config | None = None) -> Slam:
+        """The SLAM object as it was, with its settings or those given.
 
         Raises:
             CheckpointError: a field is damaged.
@@ -108,7 +111,8 @@ class SavedRun:
         from warpslam.checkpoint import slam_from_state
         from warpslam.launching import slice_count
 
-        slam = slam_from_state(self.path, *self.state, device=self.request.device)
+        slam = slam_from_state(self.path, *self.state, device=self.request.device, config=config)
+        slam.config.mapping.enabled &= not self.request.localize_only
         slices = self.state[0].get("slices")
         if slices != slice_count(slam.device):
             log.warning(

@@ -14,6 +14,7 @@ from warpslam.field import FieldArrays, PackedDecoder, RayBatch
 from warpslam.kernels import grid as grid_kernels
 from warpslam.kernels.grid import Lattice, Vec32
 from warpslam.launching import slice_count
+from warpslam.memory import free_gigabytes
 
 LEVELS = ("coarse", "middle", "fine", "color")
 QUERY_CHUNK = 1 << 16
@@ -123,7 +124,7 @@ class SceneMap:
         """Grow the map to hold the box ``low``..``high`` [m] plus the margin; True if it grew.
 
         Raises:
-            MapSizeError: the grown map would not fit `GridConfig.max_gigabytes`.
+            MapSizeError: the grown map would not fit `GridConfig.max_gigabytes`, or what is free.
         """
         spacing, margin = self.config.middle_spacing, self.config.margin
         if not self.is_empty and (low > self.low).all() and (high < self.high).all():
@@ -138,6 +139,14 @@ class SceneMap:
                 f"the map would grow to {np.round(high - low, 1).tolist()} m and {needed:.1f} GB, beyond "
                 f"grid.max_gigabytes = {self.config.max_gigabytes}: raise it, lower grid.max_depth "
                 f"(now {self.config.max_depth} m), or check the depth scale"
+            )
+        more = needed - (0.0 if self.is_empty else self.gigabytes(self.low, self.high))
+        free = free_gigabytes(self.device)
+        if free is not None and more > free:
+            raise MapSizeError(
+                f"the map would grow to {np.round(high - low, 1).tolist()} m, which needs {more:.1f} GB more, and "
+                f"{self.device} has {free:.1f} GB free: lower grid.max_depth (now {self.config.max_depth} m), or check "
+                "the depth scale"
             )
         self.low, self.high = low, high
         for level, grid in self.grids.items():

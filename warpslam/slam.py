@@ -158,7 +158,7 @@ class Slam:
             pose = self._last_pose() if message else tracked.T_world_camera
             if located.after_loss:
                 self._first = index
-        self._append(vector_from_pose(pose), timestamp, status, depth_error)
+        self._append(vector_from_pose(pose), timestamp, status, depth_error if status == "OK" else 0.0)
 
         if status == "OK" and self.config.mapping.enabled:
             keyframe = self._is_keyframe(index)
