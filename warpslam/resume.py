@@ -228,9 +228,7 @@ def _saved_run(path: str, header: dict[str, Any], arrays: dict[str, np.ndarray])
             position=int(run["position"]),
             frame_indices=[int(index) for index in run["frame_indices"]],
             truth_poses=list(truth.reshape(-1, 4, 4)),
-            results=[
-                FrameResult(T_world_camera=pose, **row) for pose, row in zip(poses, run["results"], strict=True)
-            ],
+            results=[FrameResult(T_world_camera=pose, **row) for pose, row in zip(poses, run["results"], strict=True)],
             unreadable_count=int(run["unreadable_count"]),
             seconds={str(name): float(seconds) for name, seconds in run["seconds"].items()},
             first_index=int(run["first_index"]),
