@@ -212,7 +212,7 @@ def frame_digest(frame: Frame) -> str:
     """SHA-256 of a frame's images and time."""
     digest = hashlib.sha256(repr(float(frame.timestamp)).encode())
     for image in (frame.rgb, frame.depth):
-        digest.update(np.ascontiguousarray(image))
+        digest.update(np.ascontiguousarray(image).data)
     return digest.hexdigest()
 
 

@@ -14,6 +14,7 @@ from warpslam.camera import Intrinsics, check_transform, pose_from_vector, vecto
 from warpslam.config import Config
 from warpslam.decoders import Decoders, load_decoders
 from warpslam.errors import InputError
+from warpslam.frustum import measured_extent
 from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth, check_window_fits
 from warpslam.launching import compile_kernels, synchronize
 from warpslam.mapper import Mapper
@@ -206,7 +207,7 @@ class Slam:
 
     def _map(self, index: int, depth: np.ndarray, first: bool) -> dict[str, float]:
         vector = self._vectors[index]
-        self.scene.cover(*self._extent(depth, pose_from_vector(vector)))
+        self.scene.cover(*measured_extent(depth, pose_from_vector(vector), self.intrinsics))
         if first:
             result = self._mapper.map_first(self._images, index, vector)
         else:
@@ -222,18 +223,6 @@ class Slam:
         self._vectors[index] = vector
         for keyframe in self.keyframes:
             self._vectors[keyframe.index] = keyframe.pose.copy()
-
-    def _extent(self, depth: np.ndarray, T_world_camera: np.ndarray, stride: int = 4) -> tuple[np.ndarray, np.ndarray]:
-        """Box of the camera and of everything it measures [m]."""
-        v, u = np.nonzero(depth[::stride, ::stride])
-        d = depth[::stride, ::stride][v, u].astype(np.float64)
-        camera = self.intrinsics
-        rays = np.stack(
-            [(u * stride - camera.cx) / camera.fx, (v * stride - camera.cy) / camera.fy, np.ones(len(u))], 1
-        )
-        points = (rays * d[:, None]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-        points = np.concatenate([points, T_world_camera[None, :3, 3]])
-        return points.min(axis=0), points.max(axis=0)
 
     # -- what came out -------------------------------------------------------------------------------------------
 
