@@ -51,6 +51,7 @@ class FakeResult:
     status: str = "OK"
     losses: dict[str, float] = field(default_factory=lambda: {"loss": 1.5})
     inliers: float = 0.9
+    depth_error: float = 0.02
     timings: dict[str, float] = field(default_factory=lambda: {"tracking": 0.25, "mapping": 0.5})
     message: str = ""
 
@@ -122,6 +123,9 @@ class FakeSlam:
         mesh = wall()
         mesh.visual.vertex_colors = np.tile(np.uint8([10, 20, 30, 255]), (len(mesh.vertices), 1))
         return mesh
+
+    def memory(self) -> dict[str, float | None]:
+        return {"state_bytes": 8}
 
     def save(self, path: Path) -> None:
         Path(path).write_bytes(b"fake map")

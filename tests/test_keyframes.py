@@ -1,11 +1,14 @@
 """Keyframe images and overlap."""
 
+import zlib
+
 import numpy as np
 import pytest
 import warp as wp
 
 from warpslam.camera import Intrinsics
-from warpslam.keyframes import ImagePool, overlap_fractions
+from warpslam.errors import MapSizeError
+from warpslam.keyframes import CompactImage, ImagePool, overlap_fractions
 
 CAMERA = Intrinsics(100.0, 100.0, 79.5, 59.5, 160, 120)
 
@@ -31,17 +34,51 @@ def test_overlap_falls_with_the_angle():
     assert none == 0
 
 
-def test_pool_keeps_images_when_it_grows():
-    """Every slot reads back after the pool was enlarged twice; depth to 1/131070 of its largest value, 0 stays 0."""
-    pool = ImagePool(CAMERA, wp.get_device("cpu"), capacity=2)
+def random_images(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Colour and depth without any structure, a fifth of it missing."""
     rng = np.random.default_rng(0)
-    stored = []
-    for _ in range(5):
-        rgb = rng.integers(0, 256, (120, 160, 3)).astype(np.uint8)
+    images = []
+    for _ in range(count):
         depth = rng.uniform(0.5, 6.0, (120, 160)).astype(np.float32)
         depth[rng.random(depth.shape) < 0.2] = 0.0
-        stored.append((pool.add(rgb, depth), rgb, depth))
-    for slot, rgb, depth in stored:
-        np.testing.assert_array_equal(pool.rgb.numpy()[slot], rgb)
-        np.testing.assert_allclose(pool.depth_image(slot), depth, atol=6.0 / 131070 * 1.01)
-        assert (pool.depth_image(slot)[depth == 0] == 0).all()
+        images.append((rng.integers(0, 256, (120, 160, 3)).astype(np.uint8), depth))
+    return images
+
+
+@pytest.mark.parametrize("slots", [3, 100])
+def test_pool_gives_back_every_image(slots):
+    """Whether all images fit on the device or only two beside the current one, each is brought back as it was; depth to
+    1/131070 of its largest value, 0 stays 0.
+    """
+    pool = ImagePool(CAMERA, wp.get_device("cpu"), slots * 5 * 120 * 160 / 1e9, capacity=2)
+    images = random_images(5)
+    numbers = [pool.add(*image) for image in images]
+    for pair in ((0, 1), (1, 2), (4, 3), (2, 2), (0, 4)):
+        for n, slot in zip(pair, pool.bring([numbers[n] for n in pair]), strict=True):
+            rgb, depth = images[n]
+            assert slot > 0
+            np.testing.assert_array_equal(pool.rgb.numpy()[slot], rgb)
+            np.testing.assert_allclose(pool.depth_image(slot), depth, atol=6.0 / 131070 * 1.01)
+            assert (pool.depth_image(slot)[depth == 0] == 0).all()
+    assert pool.rgb.shape[0] <= slots
+
+
+def test_pool_says_what_it_needs():
+    """More images at a time than the budget has room for: what is needed, what there is, and the setting."""
+    pool = ImagePool(CAMERA, wp.get_device("cpu"), 3.9 * 5 * 120 * 160 / 1e9)
+    numbers = [pool.add(*image) for image in random_images(3)]
+    with pytest.raises(MapSizeError, match="needs 4 images.*0.0004 GB.*max_gigabytes has room for 3"):
+        pool.bring(numbers)
+
+
+def test_compact_images_are_smaller_and_exact():
+    """Smooth images shrink to less than a third; what does not hold an image is refused, whatever it inflates to."""
+    v, u = np.mgrid[:120, :160]
+    rgb = np.stack([u, v, u + v], -1).astype(np.uint8)
+    image = CompactImage.of(rgb, (100 * v + u).astype(np.uint16), 0.001)
+    assert len(image.rgb) + len(image.depth) < 5 * 120 * 160 / 3
+    for back, original in zip(image.unpack(CAMERA), (rgb, 100 * v + u, 0.001), strict=True):
+        np.testing.assert_array_equal(back, original)
+    bomb = CompactImage(zlib.compress(bytes(10**7)), image.depth, 1.0)
+    with pytest.raises(ValueError, match="compressed image"):
+        bomb.unpack(CAMERA)

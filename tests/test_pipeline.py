@@ -48,9 +48,9 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
     folder = result.folder
     assert result.status == "finished"
     assert {file.name for file in folder.path.iterdir()} == {
-        "config.yaml", "trajectory.tum", "ground_truth.tum", "mesh.ply", "map.npz", "metrics.json", "timing.json",
-        "input.json", "log.txt", "trajectory_top_view.png", "error_over_time.png", "panels.png", "panels.npz",
-        "frames.json", "report.html",
+        "config.yaml", "trajectory.tum", "ground_truth.tum", "mesh.ply", "map.safetensors", "metrics.json",
+        "timing.json", "input.json", "log.txt", "trajectory_top_view.png", "error_over_time.png", "panels.png",
+        "panels.npz", "frames.csv", "frames.json", "report.html",
     }  # fmt: skip
     assert yaml.safe_load(folder.config.read_text())["mapping"]["window"] == Config().mapping.window
     metrics = metrics_of(folder.path)
@@ -292,7 +292,7 @@ def test_missing_pieces_of_a_run_are_named(tmp_path):
     folder = RunFolder.open(tmp_path)
     with pytest.raises(DatasetError, match="metrics.json"):
         read_json(folder.metrics)
-    with pytest.raises(DatasetError, match="no map.npz"):
+    with pytest.raises(DatasetError, match="no map.safetensors"):
         folder.require(folder.map, "the run stopped before it had a map")
     with pytest.raises(MeshError, match="metrics.json"):
         pipeline.load_mesh(folder.metrics)

@@ -6,7 +6,8 @@ import warp as wp
 
 from warpslam.config import GridConfig
 from warpslam.decoders import random_decoders
-from warpslam.errors import InputError, WarpSlamError
+from warpslam.errors import InputError, MapSizeError
+from warpslam.memory import free_gigabytes
 from warpslam.scene import SceneMap
 
 DEVICES = ["cpu", *(str(d) for d in wp.get_cuda_devices())]
@@ -69,9 +70,27 @@ def test_refuses_to_grow_beyond_the_memory_limit():
     scene = new_map("cpu", max_gigabytes=0.2)
     scene.cover(np.zeros(3), np.ones(3))
     before = scene.bounds[1].copy()
-    with pytest.raises(WarpSlamError, match="max_gigabytes"):
+    with pytest.raises(MapSizeError, match="max_gigabytes"):
         scene.cover(np.zeros(3), np.full(3, 100.0))
     np.testing.assert_array_equal(scene.bounds[1], before)
+
+
+def test_refuses_to_grow_beyond_what_is_free(monkeypatch):
+    """The error says what is needed and what there is, and the map stays as it was."""
+    scene = new_map("cpu")
+    scene.cover(np.zeros(3), np.ones(3))
+    before = scene.bounds[1].copy()
+    monkeypatch.setattr("warpslam.scene.free_gigabytes", lambda device: 0.01)
+    with pytest.raises(MapSizeError, match=r"needs 2\.\d GB more, and cpu has 0.0 GB free"):
+        scene.cover(np.zeros(3), np.full(3, 20.0))
+    np.testing.assert_array_equal(scene.bounds[1], before)
+    monkeypatch.setattr("warpslam.scene.free_gigabytes", lambda device: None)
+    assert scene.cover(np.zeros(3), np.full(3, 2.0))
+
+
+def test_free_memory_is_told():
+    """More than nothing, and less than any machine has."""
+    assert 0.0 < (free_gigabytes(wp.get_device("cpu")) or 1.0) < 1e5
 
 
 def test_query_errors():

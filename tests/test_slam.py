@@ -25,6 +25,8 @@ SMALL = [
     "tracking.ignore_edge_v=4",
     "tracking.lost_depth_error=10",
     "tracking.lost_inliers=0",
+    "tracking.max_step=10",
+    "tracking.max_turn=180",
     "mapping.pixels=100",
     "mapping.every=2",
     "mapping.first_iterations=20",
@@ -213,8 +215,8 @@ def test_saved_state_goes_on_exactly(frames, tmp_path):
     """A run that is saved, loaded and continued equals one that was never interrupted."""
     whole = run(frames[:6])
     half = run(frames[:3])
-    half.save(tmp_path / "map.npz")
-    loaded = Slam.load(tmp_path / "map.npz", "cpu")
+    half.save(tmp_path / "map.safetensors")
+    loaded = Slam.load(tmp_path / "map.safetensors", "cpu")
     for frame in frames[3:6]:
         loaded.step(frame.rgb, frame.depth, frame.timestamp)
     np.testing.assert_array_equal(loaded.trajectory.poses, whole.trajectory.poses)
@@ -225,13 +227,13 @@ def test_saved_state_goes_on_exactly(frames, tmp_path):
 
 def test_unusable_map_file(frames, tmp_path):
     """Missing, truncated, or foreign: CheckpointError with the path."""
-    with pytest.raises(CheckpointError, match="nothing.npz"):
-        Slam.load(tmp_path / "nothing.npz")
-    path = tmp_path / "map.npz"
+    with pytest.raises(CheckpointError, match="nothing.safetensors"):
+        Slam.load(tmp_path / "nothing.safetensors")
+    path = tmp_path / "map.safetensors"
     run(frames[:1]).save(path)
     path.write_bytes(path.read_bytes()[:5000])
-    with pytest.raises(CheckpointError, match="map.npz"):
+    with pytest.raises(CheckpointError, match="map.safetensors"):
         Slam.load(path)
     np.savez(path, something=np.zeros(3))
-    with pytest.raises(CheckpointError, match="map.npz"):
+    with pytest.raises(CheckpointError, match="map.safetensors"):
         Slam.load(path)

@@ -26,7 +26,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--stride", type=int, default=2, help="render every n-th pixel")
     options = parser.parse_args(arguments)
     try:
-        slam, sequence = Slam.load(options.run / "map.npz"), open_sequence(options.sequence)
+        slam, sequence = Slam.load(options.run / "map.safetensors"), open_sequence(options.sequence)
     except WarpSlamError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -219,7 +219,7 @@ def _parser() -> argparse.ArgumentParser:
     command = commands.add_parser("quiet", parents=[shared], help="silence the fine decoder at zero feature")
     command.add_argument("--start", type=Path, required=True, help="decoders to start from")
     command.add_argument("--rooms", type=int, default=12, help="training rooms that are mapped for features")
-    command.add_argument("--steps", type=int, default=8000, help="Adam steps")
+    command.add_argument("--steps", type=int, default=1600, help="Adam steps")
     command.add_argument("--seed", type=int, default=0, help="seed of the draws")
     command.set_defaults(run=quiet)
     command = commands.add_parser("export", parents=[shared], help="write the package's file")

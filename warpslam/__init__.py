@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from warpslam.errors import ConfigError as ConfigError
     from warpslam.errors import DatasetError as DatasetError
     from warpslam.errors import InputError as InputError
+    from warpslam.errors import MapSizeError as MapSizeError
     from warpslam.errors import MeshError as MeshError
     from warpslam.errors import MissingDependencyError as MissingDependencyError
     from warpslam.errors import WarpSlamError as WarpSlamError
@@ -45,6 +46,7 @@ _MODULE_OF = {
     "FrameResult": "warpslam.slam",
     "InputError": "warpslam.errors",
     "Intrinsics": "warpslam.camera",
+    "MapSizeError": "warpslam.errors",
     "MeshError": "warpslam.errors",
     "MissingDependencyError": "warpslam.errors",
     "PRESETS": "warpslam.config",

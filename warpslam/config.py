@@ -95,11 +95,23 @@ class TrackingConfig(_Group):
     )
     lost_inliers: float = Field(0.35, ge=0, le=1, description="share of inliers below which tracking is lost")
     recovery_factor: int = Field(5, ge=1, description="iterations and pixels grow by this when tracking is lost")
+    max_step: float = Field(
+        0.1, gt=0, description="a longer step a frame [m] is doubted, unless the last ones were nearly as long"
+    )
+    max_turn: float = Field(10.0, gt=0, description="the same for the turn a frame [degrees]")
+    relocalization: bool = Field(True, description="a lost camera is looked for at the keyframes")
+    relocalization_keyframes: int = Field(
+        5, ge=1, description="keyframes tried a frame, those most like it in coarse grey and depth"
+    )
+    relocalized_depth_error: float = Field(
+        0.05, gt=0, description="a pose found again errs less in depth than this [m], or 1.5 x what was usual before"
+    )
 
 
 class MappingConfig(_Group):
     """Mapping and local bundle adjustment (Sec. 3.3, Eq. 8-10)."""
 
+    enabled: bool = Field(True, description="off: the camera is only tracked in a map that was loaded")
     every: int = Field(5, ge=1, description="map every n-th frame")
     pixels: int = Field(1000, ge=16, le=200_000, description="rays per iteration over all frames of the window")
     window: int = Field(
@@ -147,6 +159,9 @@ class KeyframeConfig(_Group):
     )
     known_error: float = Field(
         0.1, gt=0, description="information gain: a pixel is explained below this relative depth error"
+    )
+    max_gigabytes: float = Field(
+        2.0, gt=0, description="images on the device [GB]; more keyframes than fit are kept compressed in host memory"
     )
 
 
@@ -237,6 +252,17 @@ class Config(_Group):
         for part in (PRESETS[name], *map(_parse_override, overrides or [])):
             _merge(values, part)
         return cls.from_dict(values, source=f"preset {name}")
+
+    def updated(self, overrides: list[str]) -> Config:
+        """These settings with overrides of the form ``group.field=value``.
+
+        Raises:
+            ConfigError: malformed override, or a value out of range.
+        """
+        values = self.model_dump()
+        for override in overrides:
+            _merge(values, _parse_override(override))
+        return self.from_dict(values)
 
     @classmethod
     def load(cls, path: str | Path) -> Config:

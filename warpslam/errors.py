@@ -17,6 +17,10 @@ class CheckpointError(WarpSlamError):
     """A decoder or map file is missing, damaged, or does not fit."""
 
 
+class MapSizeError(WarpSlamError):
+    """The map or its keyframes need more memory than the settings or the machine have."""
+
+
 class InputError(WarpSlamError, ValueError):
     """An argument of the Python API has the wrong shape, type or range."""
 

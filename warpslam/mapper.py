@@ -115,6 +115,7 @@ class Mapper:
         rng = np.random.default_rng([self.seed, 2, frame, round_])
         size = config.window * (2 if refinement else 1)
         window = self._choose_window(images, vector, keyframes, size, rng)
+        coarse = self._choose_coarse_window(keyframes, rng) if config.coarse and not refinement else []
         adjust = (
             config.bundle_adjustment
             and config.bundle_adjustment_rate > 0
@@ -124,13 +125,17 @@ class Mapper:
         window.sort(key=lambda keyframe: keyframe.index)
         rates = np.full((1, 2), config.bundle_adjustment_rate)
         self._poses.begin(np.stack([*(keyframe.pose for keyframe in window), vector]), rates)
-        slots = wp.array([*(keyframe.slot for keyframe in window), 0], dtype=int, device=self.device)
+        # Both windows at once: they must be on the device together.
+        in_use = images.bring([keyframe.image for keyframe in (*window, *coarse)])
+        slots = wp.array([*in_use[: len(window)], 0], dtype=int, device=self.device)
         self._select(images, vector, everything=refinement)
         result = MappingResult(vector, window=[keyframe.index for keyframe in window], adjusted=adjust)
         self._launcher.forget()
 
         if config.coarse and not refinement:
-            coarse_slots, coarse_poses = self._coarse_window(keyframes, vector, rng)
+            coarse_slots = wp.array([*in_use[len(window) :], 0], dtype=int, device=self.device)
+            poses = np.stack([*(keyframe.pose for keyframe in coarse), vector]).astype(np.float32)
+            coarse_poses = wp.array(poses, dtype=float, device=self.device)
             count = config.first_iterations if not keyframes and rate_factor != 1.0 else config.coarse_iterations
             self._run_coarse(images, frame, coarse_slots, coarse_poses, count, rate_factor, result)
 
@@ -238,17 +243,12 @@ class Mapper:
 
     # -- the coarse level (Sec. 3.1; in the released code it serves forecasts only) -------------------------------
 
-    def _coarse_window(
-        self, keyframes: list[Keyframe], vector: np.ndarray, rng: np.random.Generator
-    ) -> tuple[wp.array, wp.array]:
-        """Random keyframes from all but the last, the last one, and the current frame."""
-        chosen: list[Keyframe] = []
-        if keyframes:
-            *others, last = keyframes
-            chosen = [others[n] for n in rng.permutation(len(others))[: max(self.config.window - 2, 0)]] + [last]
-        poses = np.stack([*(keyframe.pose for keyframe in chosen), vector]).astype(np.float32)
-        slots = [*(keyframe.slot for keyframe in chosen), 0]
-        return wp.array(slots, dtype=int, device=self.device), wp.array(poses, dtype=float, device=self.device)
+    def _choose_coarse_window(self, keyframes: list[Keyframe], rng: np.random.Generator) -> list[Keyframe]:
+        """Random keyframes from all but the last, and the last one."""
+        if not keyframes:
+            return []
+        *others, last = keyframes
+        return [*(others[n] for n in rng.permutation(len(others))[: max(self.config.window - 2, 0)]), last]
 
     def _run_coarse(
         self,

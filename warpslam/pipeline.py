@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import dataclasses
 import logging
 import os
 import platform
@@ -33,6 +35,14 @@ from warpslam.evaluation import (
     write_tum,
 )
 from warpslam.method import DEFAULT_METHOD, build_method, load_method
+from warpslam.resume import (
+    RunProgress,
+    RunRequest,
+    SavedRun,
+    frame_digest,
+    remove_checkpoints,
+    write_checkpoint,
+)
 from warpslam.run_folder import RunFolder, Source, read_json, write_json
 
 if TYPE_CHECKING:
@@ -44,7 +54,7 @@ if TYPE_CHECKING:
     from warpslam.method import Method
     from warpslam.plots import Panel
     from warpslam.sequences.base import Frame, RgbdSequence
-    from warpslam.slam import FrameResult
+    from warpslam.slam import FrameResult, Slam
     from warpslam.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -100,6 +110,10 @@ def run(
     on_module: Callable[[ModuleProgress], None] | None = None,
     method: str = DEFAULT_METHOD,
     poses: str | Path | None = None,
+    checkpoint_every: int | None = None,
+    map_path: str | Path | None = None,
+    localize_only: bool = False,
+    saved: SavedRun | None = None,
 ) -> RunResult:
     """Run SLAM over a sequence and write a run folder.
 
@@ -117,17 +131,46 @@ def run(
         method: One of `warpslam.method.METHODS`.
         poses: Trajectory in the TUM format whose poses are given to the method in place of the sequence's own; frames
             without one are left out. Errors are against the sequence's own as ever.
+        checkpoint_every: Frames between two checkpoints; None for none. The schedule has to be deterministic for a
+            resumed run to give the same bytes.
+        map_path: Map to start from, a file that `Slam.save` wrote; the first frame is looked for in it.
+        localize_only: The map is left as it is.
+        saved: Checkpoint of the run in ``output``, which goes on from there; all else must be as it was.
 
     Raises:
         WarpSlamError: The input or a setting can't be used. metrics.json is written even so.
     """
     selected = select_frames(sequence, frames)
-    folder = RunFolder.create(output, sequence.name)
-    with _log_file(folder.log):
+    _check_checkpoint_settings(checkpoint_every, map_path, localize_only, method)
+    request = RunRequest(
+        sequence.name,
+        len(sequence),
+        dataclasses.asdict(sequence.intrinsics),
+        (selected.start, selected.stop, selected.step),
+        config.model_dump(),
+        seed,
+        _device_name(device),
+        str(map_path) if map_path is not None else None,
+        localize_only,
+        dataclasses.asdict(source) if source is not None else None,
+        str(poses) if poses is not None else None,
+    )
+    if saved is None:
+        folder = RunFolder.create(output, sequence.name)
+    else:
+        assert output is not None
+        saved.check(request, sequence)
+        folder = RunFolder(output)
+        folder.clear_results()
+    with _log_file(folder.log, append=saved is not None):
         given = None if poses is None else GivenPoses.read(poses)
-        return _Run(
+        run_ = _Run(
             sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame, on_module, method, given
-        ).execute()
+        )
+        run_.request, run_.checkpoint_every = request, checkpoint_every
+        if saved is not None:
+            run_.go_on_from(saved)
+        return run_.execute()
 
 
 class _Run:
@@ -157,15 +200,32 @@ class _Run:
         self.frame_indices: list[int] = []
         self.truth_poses: list[np.ndarray] = []
         self.results: list[FrameResult] = []
-        self.unreadable_count = 0
         self.left_out: list[dict[str, Any]] = []
         self.seconds: dict[str, float] = defaultdict(float)
+        self.request: RunRequest | None = None
+        self.checkpoint_every: int | None = None
+        self.saved: SavedRun | None = None
+        self.position = 0  # in the selection
+        self.first_index = 0  # frames of the map that the run started from
+        self.resumed_count = 0  # results that came from a checkpoint
+        self.digests: dict[int, str] = {}
+        self.start = self.frames_start = 0.0
         self.ate: AteResult | None = None
         self.reconstruction: ReconstructionResult | None = None
         self.metrics: dict[str, Any] = {}
 
+    def go_on_from(self, saved: SavedRun) -> None:
+        """Take up a run at its checkpoint."""
+        progress, self.saved = saved.progress, saved
+        self.position, self.first_index = progress.position, progress.first_index
+        self.frame_indices, self.truth_poses = progress.frame_indices, progress.truth_poses
+        self.results, self.left_out = progress.results, progress.left_out
+        self.seconds.update(progress.seconds)
+        self.digests = progress.digests
+        self.resumed_count = len(progress.results)
+
     def execute(self) -> RunResult:
-        start = time.perf_counter()
+        self.start = time.perf_counter()
         try:
             try:
                 self._write_input()
@@ -177,12 +237,15 @@ class _Run:
                 log.warning("interrupted: writing what there is; press ctrl-C again to leave it")
             if self.results:
                 self._write_trajectory()
+                self._write_frames()
                 self._evaluate_trajectory()
                 self._write_map()
                 self._describe_map()
                 self._write_mesh()
                 self._evaluate_reconstruction()
                 self._draw_plots()
+            if self.status == "finished":
+                remove_checkpoints(self.folder)
         except KeyboardInterrupt:
             self.status = "interrupted"
         except Exception as error:
@@ -193,9 +256,9 @@ class _Run:
                 self._write_trajectory()
             raise
         finally:
-            self.seconds["total"] = time.perf_counter() - start
+            self.seconds["total"] += time.perf_counter() - self.start
             self._write_timing()
-            self._write_frames()
+            self._write_frame_records()
             self._write_metrics()
             self._write_report()
         return RunResult(self.folder, self.status, self.metrics, self.ate, self.reconstruction)
@@ -207,59 +270,111 @@ class _Run:
         log.info("%s: %d of %d frames, %s", self.sequence.name, len(self.selected), len(self.sequence), self.selected)
 
     def _build_slam(self) -> None:
+        request = self.request
         with self._clock("setup"):
             with self._clock("kernel_compile"):
                 self.modules = load_kernels(self.sequence, self.device, self.on_module)
-            build = build_slam if self.method == DEFAULT_METHOD else partial(build_baseline, self.method)
-            self.slam = build(self.sequence.intrinsics, self.config, self.device, self.seed)
+            if self.saved is not None:
+                self.slam = self.saved.slam(self.config)
+                log.info("resumed from %s, after %d frames", self.saved.path, self.position)
+            elif request is not None and request.map is not None:
+                self.slam = open_map(
+                    request.map, self.sequence.intrinsics, self.config, self.device, localize_only=request.localize_only
+                )
+                self.first_index = len(self.slam.trajectory.poses)
+            else:
+                build = build_slam if self.method == DEFAULT_METHOD else partial(build_baseline, self.method)
+                self.slam = build(self.sequence.intrinsics, self.config, self.device, self.seed)
         self.seconds["kernel_compile"] += self.slam.compile_seconds
 
     def _process_frames(self) -> None:
         assert self.slam is not None
         with self._clock("frames"):
-            start = time.perf_counter()
+            start = self.frames_start = time.perf_counter()
+            self._write_checkpoint()
             for frame in self._readable_frames():
                 T_world_camera = frame.T_world_camera
                 if T_world_camera is not None and not np.isfinite(T_world_camera).all():
                     T_world_camera = None
                 self.frame_indices.append(frame.index)
                 self.truth_poses.append(np.full((4, 4), np.nan) if T_world_camera is None else T_world_camera)
-                given = T_world_camera if self.given is None else self.given.at(frame.timestamp)
+                if self.given is not None:
+                    given = self.given.at(frame.timestamp)
+                else:
+                    # The world of a map that was loaded need not be that of the sequence's true poses.
+                    given = T_world_camera if self._knows_poses() else None
                 result = self.slam.step(frame.rgb, frame.depth, timestamp=frame.timestamp, T_world_camera=given)
                 self.results.append(result)
                 level = logging.INFO if result.status == "OK" else logging.WARNING
                 log.log(level, "frame %d: %s", frame.index, _describe(result))
                 if self.on_frame is not None:
                     self.on_frame(self._progress(result, time.perf_counter() - start))
+                self._after_frame(frame)
         if not self.results:
             raise DatasetError(f"{self.sequence.name}: none of the {len(self.selected)} selected frames can be read")
 
     def _readable_frames(self) -> Iterator[Frame]:
-        for index in self.selected:
+        for index in self.selected[self.position :]:
+            self.position += 1
             try:
                 with self._clock("reading"):
                     frame = self.sequence[index]
             except DatasetError as error:
-                self.unreadable_count += 1
                 self.left_out.append({"index": index, "message": str(error)})
                 log.warning("frame %d left out: %s", index, error)
                 continue
             if self.given is not None and self.given.at(frame.timestamp) is None:
-                self.unreadable_count += 1
                 message = f"{self.given.path} has no pose for {frame.timestamp:.3f} s"
                 self.left_out.append({"index": index, "message": message})
                 log.warning("frame %d left out: %s", index, message)
                 continue
             yield frame
 
+    def _knows_poses(self) -> bool:
+        return self.request is None or self.request.map is None or self.config.tracking.use_given_poses
+
+    def _after_frame(self, frame: Frame) -> None:
+        if self.checkpoint_every is None:
+            return
+        first = next(iter(self.digests), frame.index)
+        self.digests = {index: digest for index, digest in self.digests.items() if index == first}
+        due = self.position % self.checkpoint_every == 0 or self.position == len(self.selected)
+        if due or not self.digests:
+            self.digests[frame.index] = frame_digest(frame)
+        if due:
+            self._write_checkpoint()
+
+    def _write_checkpoint(self) -> None:
+        if self.checkpoint_every is None or (self.saved is not None and self.saved.progress.position == self.position):
+            return
+        assert self.slam is not None and self.request is not None
+        now = time.perf_counter()
+        seconds = dict(self.seconds)
+        seconds["frames"] = seconds.get("frames", 0.0) + now - self.frames_start
+        seconds["total"] = seconds.get("total", 0.0) + now - self.start
+        progress = RunProgress(
+            self.position,
+            self.frame_indices,
+            self.truth_poses,
+            self.results,
+            self.left_out,
+            seconds,
+            self.first_index,
+            self.digests,
+        )
+        with self._clock("checkpoints"):
+            size = write_checkpoint(self.folder, self.request, self.checkpoint_every, progress, self.slam)
+        self.metrics["checkpoint"] = {"bytes": size, "every_frames": self.checkpoint_every}
+
     def _progress(self, result: FrameResult, elapsed: float) -> Progress:
         assert self.slam is not None
         truth = np.array(self.truth_poses)
         rmse = None
         if np.isfinite(truth).all(axis=(1, 2)).any():
-            rmse = ate(self.slam.trajectory.poses, truth).rmse
-        done = len(self.results) + self.unreadable_count
-        return Progress(done, len(self.selected), result, rmse, len(self.results) / max(elapsed, 1e-9))
+            rmse = ate(self._trajectory()[0].poses[: len(truth)], truth).rmse
+        done = len(self.results) + len(self.left_out)
+        fps = (len(self.results) - self.resumed_count) / max(elapsed, 1e-9)
+        return Progress(done, len(self.selected), result, rmse, fps)
 
     def _finish_map(self) -> None:
         assert self.slam is not None
@@ -271,14 +386,27 @@ class _Run:
     def _trajectory(self) -> tuple[Trajectory, int]:
         """The trajectory, and how many of its poses belong to frames that were finished."""
         assert self.slam is not None
+        trajectory, first = self.slam.trajectory, self.first_index
+        if first:
+            parts = (trajectory.timestamps[first:], trajectory.poses[first:], trajectory.status[first:])
+            trajectory = dataclasses.replace(trajectory, timestamps=parts[0], poses=parts[1], status=parts[2])
         # After an interrupt the trajectory may hold the pose of a frame that never came back.
-        return self.slam.trajectory, len(self.results)
+        return trajectory, len(self.results)
 
     def _write_trajectory(self) -> None:
         trajectory, count = self._trajectory()
         write_tum(self.folder.trajectory, trajectory.timestamps[:count], trajectory.poses[:count])
         if self._has_truth():
             write_tum(self.folder.ground_truth, trajectory.timestamps[:count], np.array(self.truth_poses)[:count])
+
+    def _write_frames(self) -> None:
+        """A line a frame: what the TUM format has no place for."""
+        with open(self.folder.frames, "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(["frame", "timestamp", "status", "inliers", "depth_error_m", "message"])
+            for index, result in zip(self.frame_indices, self.results, strict=False):
+                figures = (f"{result.inliers:.4f}", f"{result.depth_error:.5f}")
+                writer.writerow([index, f"{result.timestamp:.6f}", result.status, *figures, result.message])
 
     def _has_truth(self) -> bool:
         return any(np.isfinite(T).all() for T in self.truth_poses)
@@ -306,6 +434,7 @@ class _Run:
         if isinstance(self.slam, Slam):
             with self._clock("inventory"):
                 self.metrics.update(take_inventory(self.slam))
+                self.metrics["memory"] = self.slam.memory()
 
     def _write_mesh(self) -> None:
         assert self.slam is not None
@@ -402,7 +531,7 @@ class _Run:
             },
         )
 
-    def _write_frames(self) -> None:
+    def _write_frame_records(self) -> None:
         frames = [
             {
                 "index": index,
@@ -447,7 +576,7 @@ class _Run:
             "frames": {
                 "selected": len(self.selected),
                 "processed": len(self.results),
-                "unreadable": self.unreadable_count,
+                "unreadable": len(self.left_out),
                 **{status: statuses.get(status, 0) for status in ("OK", "LOST", "SKIPPED")},
             },
             "seconds": {
@@ -535,6 +664,26 @@ def build_baseline(method: str, intrinsics: Intrinsics, config: Config, device: 
     return build_method(method, intrinsics, config, device, seed)
 
 
+def open_map(
+    path: str | Path, intrinsics: Intrinsics, config: Config, device: str | None, *, localize_only: bool = False
+) -> Slam:
+    """The SLAM object of a run that starts from a map.
+
+    Raises:
+        ConfigError: There is no such device, or the settings do not fit the map.
+        CheckpointError: The map can't be loaded.
+        InputError: The map was made with another camera.
+    """
+    from warpslam.slam import Slam
+
+    check_device(device)
+    slam = Slam.load(path, device, config=config, localize_only=localize_only)
+    if slam.intrinsics != intrinsics:
+        raise InputError(f"{path} was made with another camera: {slam.intrinsics}, the sequence has {intrinsics}")
+    slam.forget_pose()
+    return slam
+
+
 def load_slam(folder: RunFolder, device: str | None = None) -> Method:
     """The SLAM object (or the baseline) as a run left it.
 
@@ -559,6 +708,25 @@ def check_device(device: str | None) -> None:
     names = [str(known) for known in wp.get_devices()]
     if device is not None and device not in (*names, "cuda"):
         raise ConfigError(f"device {device!r} is not there; this machine has {', '.join(names)}")
+
+
+def _device_name(device: str | None) -> str:
+    """The device that a name, or none, leads to; a name that leads nowhere is told of when the run starts."""
+    import warp as wp
+
+    names = [str(known) for known in wp.get_devices()]
+    return str(wp.get_device(device)) if device is None or device in (*names, "cuda") and names[1:] else str(device)
+
+
+def _check_checkpoint_settings(
+    every: int | None, map_path: str | Path | None, localize_only: bool, method: str
+) -> None:
+    if method != DEFAULT_METHOD and (every is not None or map_path is not None):
+        raise ConfigError(f"method {method} has no checkpoints and takes no map: leave out checkpoint_every and map")
+    if every is not None and every < 1:
+        raise ConfigError(f"checkpoint_every = {every} must be at least 1 frame")
+    if localize_only and map_path is None:
+        raise ConfigError("localize_only needs a map: name one with map_path (--map)")
 
 
 def render_panel(slam: Method, frame: Frame, T_world_camera: np.ndarray, stride: int = 1) -> Panel:
@@ -694,10 +862,10 @@ def _peak_memory_mib() -> float | None:
 
 
 @contextmanager
-def _log_file(path: Path) -> Iterator[None]:
+def _log_file(path: Path, *, append: bool = False) -> Iterator[None]:
     """Send everything that warpslam logs, from INFO up, to a file as well."""
     logger = logging.getLogger("warpslam")
-    handler = logging.FileHandler(path, mode="w", encoding="utf-8")
+    handler = logging.FileHandler(path, mode="a" if append else "w", encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     level = logger.level
     logger.addHandler(handler)

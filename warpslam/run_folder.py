@@ -15,13 +15,17 @@ from warpslam.errors import ConfigError, DatasetError
 
 # Removed before a run writes into a folder that an earlier run used: a stale mesh beside a new trajectory misleads.
 _WRITTEN_FILES = (
+    "checkpoint.next.safetensors",
+    "checkpoint.previous.safetensors",
+    "checkpoint.safetensors",
     "config.yaml",
     "error_over_time.png",
+    "frames.csv",
     "frames.json",
     "ground_truth.tum",
     "input.json",
     "log.txt",
-    "map.npz",
+    "map.safetensors",
     "mesh.ply",
     "metrics.json",
     "panels.npz",
@@ -31,6 +35,8 @@ _WRITTEN_FILES = (
     "trajectory.tum",
     "trajectory_top_view.png",
 )
+_MARKS_OF_A_RUN = ("metrics.json", "checkpoint.safetensors", "checkpoint.previous.safetensors")
+_KEPT_TO_RESUME = ("checkpoint.previous.safetensors", "checkpoint.safetensors", "config.yaml", "input.json", "log.txt")
 
 
 @dataclass(frozen=True)
@@ -52,9 +58,10 @@ class Source:
 class RunFolder:
     """Paths of one run.
 
-    ``config`` effective settings, ``trajectory`` and ``ground_truth`` in TUM format, ``mesh``, ``map`` for later
-    rendering, ``metrics``, ``timing``, ``frame_records`` (what became of each frame), ``source`` (how to
-    open the input again), ``log``, ``report``, the plots, and the images of the panels as arrays.
+    ``config`` effective settings, ``trajectory`` and ``ground_truth`` in TUM format, ``frames`` (status of each) and
+    ``frame_records`` (the same with losses, for the report), ``mesh``, ``map`` for later rendering, ``metrics``,
+    ``timing``, ``source`` (how to open the input again), ``log``, ``report``, the plots, and the images of the panels
+    as arrays. While a run is under way, ``checkpoint`` and ``previous_checkpoint`` (see `warpslam.resume`).
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -63,7 +70,10 @@ class RunFolder:
         self.trajectory = self.path / "trajectory.tum"
         self.ground_truth = self.path / "ground_truth.tum"
         self.mesh = self.path / "mesh.ply"
-        self.map = self.path / "map.npz"
+        self.map = self.path / "map.safetensors"
+        self.checkpoint = self.path / "checkpoint.safetensors"
+        self.previous_checkpoint = self.path / "checkpoint.previous.safetensors"
+        self.frames = self.path / "frames.csv"
         self.metrics = self.path / "metrics.json"
         self.timing = self.path / "timing.json"
         self.frame_records = self.path / "frames.json"
@@ -91,7 +101,7 @@ class RunFolder:
         folder = Path(path) if path is not None else _free_name(Path(root) / _as_file_name(name))
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            if (folder / "metrics.json").exists():
+            if any((folder / name).exists() for name in _MARKS_OF_A_RUN):
                 for file in _WRITTEN_FILES:
                     (folder / file).unlink(missing_ok=True)
         except OSError as error:
@@ -111,6 +121,11 @@ class RunFolder:
         if not folder.metrics.is_file():
             raise DatasetError(f"{path} is no run folder: it has no metrics.json; pass what 'warpslam run -o' wrote")
         return folder
+
+    def clear_results(self) -> None:
+        """Remove what a run that stopped early wrote at its end, before it goes on."""
+        for name in set(_WRITTEN_FILES) - set(_KEPT_TO_RESUME):
+            (self.path / name).unlink(missing_ok=True)
 
     def require(self, file: Path, remedy: str) -> Path:
         """Return ``file``, or raise `DatasetError` with ``remedy`` if the run did not write it."""

@@ -9,11 +9,12 @@ import warp as wp
 
 from warpslam.config import GridConfig
 from warpslam.decoders import Decoders
-from warpslam.errors import InputError, WarpSlamError
+from warpslam.errors import InputError, MapSizeError
 from warpslam.field import FieldArrays, PackedDecoder, RayBatch
 from warpslam.kernels import grid as grid_kernels
 from warpslam.kernels.grid import Lattice, Vec32
 from warpslam.launching import slice_count
+from warpslam.memory import free_gigabytes
 from warpslam.profiling import phase
 
 LEVELS = ("coarse", "middle", "fine", "color")
@@ -125,7 +126,7 @@ class SceneMap:
         """Grow the map to hold the box ``low``..``high`` [m] plus the margin; True if it grew.
 
         Raises:
-            WarpSlamError: the grown map would not fit `GridConfig.max_gigabytes`.
+            MapSizeError: the grown map would not fit `GridConfig.max_gigabytes`, or what is free.
         """
         spacing, margin = self.config.middle_spacing, self.config.margin
         if not self.is_empty and (low > self.low).all() and (high < self.high).all():
@@ -136,10 +137,18 @@ class SceneMap:
             low, high = np.minimum(low, self.low), np.maximum(high, self.high)
         needed = self.gigabytes(low, high)
         if needed > self.config.max_gigabytes:
-            raise WarpSlamError(
+            raise MapSizeError(
                 f"the map would grow to {np.round(high - low, 1).tolist()} m and {needed:.1f} GB, beyond "
                 f"grid.max_gigabytes = {self.config.max_gigabytes}: raise it, lower grid.max_depth "
                 f"(now {self.config.max_depth} m), or check the depth scale"
+            )
+        more = needed - (0.0 if self.is_empty else self.gigabytes(self.low, self.high))
+        free = free_gigabytes(self.device)
+        if free is not None and more > free:
+            raise MapSizeError(
+                f"the map would grow to {np.round(high - low, 1).tolist()} m, which needs {more:.1f} GB more, and "
+                f"{self.device} has {free:.1f} GB free: lower grid.max_depth (now {self.config.max_depth} m), or check "
+                "the depth scale"
             )
         self.low, self.high = low, high
         for level, grid in self.grids.items():

@@ -16,15 +16,17 @@ from warpslam.complexity import field_flops, weight_count
 from warpslam.config import Config
 from warpslam.decoders import Decoders, load_decoders
 from warpslam.errors import InputError
+from warpslam.frustum import measured_extent
 from warpslam.images import read_images
-from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth
+from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth, check_window_fits
 from warpslam.launching import synchronize
 from warpslam.mapper import Mapper
 from warpslam.meshing import ObservedView, extract_mesh
 from warpslam.profiling import phase
+from warpslam.relocalization import Localizer, Track
 from warpslam.rendering import RenderedImage, render_image
 from warpslam.scene import SceneMap
-from warpslam.tracker import Tracker, TrackingResult
+from warpslam.tracker import Tracker
 from warpslam.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -38,8 +40,8 @@ class FrameResult:
     """What `Slam.step` returns.
 
     index: Frame number from 0. timestamp: [s].
-    T_world_camera: Estimated pose, float64 (4, 4).
-    status: "OK"; "LOST" (tracking failed, pose unreliable, map untouched); "SKIPPED" (nothing usable in the frame).
+    T_world_camera: Estimated pose, float64 (4, 4); of a frame that is not OK, that of the last one that was.
+    status: "OK"; "LOST" (the pose was not found, the map is untouched); "SKIPPED" (nothing usable in the frame).
     losses: Mean loss per ray: "tracking", and of the mapping stages that ran.
     inliers: Share of the depth rays that agree with the map, in [0, 1].
     depth_error: Mean |measured - rendered depth| of the inliers [m].
@@ -86,7 +88,8 @@ class Slam:
     ) -> None:
         self.intrinsics = intrinsics
         self.config = config if config is not None else Config()
-        _check_image_size(intrinsics, self.config)
+        _check_settings(intrinsics, self.config)
+        check_window_fits(intrinsics, self.config.keyframes.max_gigabytes, self.config.mapping.window)
         self.device = wp.get_device(device)
         self.seed = seed
         start = time.perf_counter()
@@ -94,12 +97,15 @@ class Slam:
         self.compile_seconds = time.perf_counter() - start
         self.scene = SceneMap(decoders or load_decoders(self.config.decoders), self.config.grid, self.device, seed)
         self.keyframes: list[Keyframe] = []
-        self._images = ImagePool(intrinsics, self.device)
+        self._images = ImagePool(intrinsics, self.device, self.config.keyframes.max_gigabytes)
         self._tracker = Tracker(intrinsics, self.config.tracking, self.config.sampling, self.device, seed)
+        self._localizer = Localizer(self._tracker, self.config.tracking, intrinsics)
         self._mapper = Mapper(self.scene, intrinsics, self.config.mapping, self.config.sampling, self.device, seed)
         self._vectors: list[np.ndarray] = []
         self._timestamps: list[float] = []
         self._status: list[str] = []
+        self._depth_errors: list[float] = []
+        self._first = 0
         self._seen: list[SeenDepth] = []
         self._current: int | None = None
         self._mapped: int | None = None
@@ -122,12 +128,13 @@ class Slam:
             depth: z-depth (H, W): float in metres, or uint16 with ``depth_scale``. 0, NaN, infinite or negative =
             missing.
             timestamp: Time [s]; frame number / 30 by default.
-            T_world_camera: Known pose (4, 4): used for the first frame (identity by default), and for every frame with
-                `TrackingConfig.use_given_poses`.
+            T_world_camera: Known pose (4, 4): used for the first frame (identity by default), for the first after
+                `forget_pose`, and for every frame with `TrackingConfig.use_given_poses`.
             depth_scale: Units per metre of integer depth, for example 1000 or 5000.
 
         Raises:
             InputError: an array has the wrong shape or type, or a pose is needed and not given.
+            MapSizeError: the map would outgrow the memory set for it.
         """
         index = len(self._vectors)
         timestamp = index / 30.0 if timestamp is None else float(timestamp)
@@ -144,18 +151,23 @@ class Slam:
         losses: dict[str, float] = {}
         status, message, inliers, depth_error = "OK", "", 1.0, 0.0
         first = self.scene.is_empty
-        if first or self.config.tracking.use_given_poses:
+        if first and not self.config.mapping.enabled:
+            raise InputError("the map is empty and mapping.enabled is off: load a map with Slam.load")
+        track = Track(self._vectors, self._status, self._depth_errors, self._first)
+        if first or self.config.tracking.use_given_poses or (track.last is None and given is not None):
             pose = np.eye(4) if given is None else given
         else:
             with _timed(timings, "tracking", self.device):
-                tracked = self._track(index)
-            pose, inliers, depth_error = tracked.T_world_camera, tracked.inliers, tracked.depth_error
-            losses["tracking"] = tracked.loss
-            message = self._why_lost(tracked)
+                located = self._localizer.locate(self.scene.arrays(), self._images, index, track, self.keyframes)
+            tracked, message = located.tracked, located.why_lost
+            inliers, depth_error, losses["tracking"] = tracked.inliers, tracked.depth_error, tracked.loss
             status = "LOST" if message else "OK"
-        self._append(vector_from_pose(pose), timestamp, status)
+            pose = self._last_pose() if message else tracked.T_world_camera
+            if located.after_loss:
+                self._first = index
+        self._append(vector_from_pose(pose), timestamp, status, depth_error if status == "OK" else 0.0)
 
-        if status == "OK":
+        if status == "OK" and self.config.mapping.enabled:
             keyframe = self._is_keyframe(index)
             if first or index % self.config.mapping.every == 0:
                 with _timed(timings, "mapping", self.device):
@@ -172,7 +184,7 @@ class Slam:
         """
         timings: dict[str, float] = {}
         index = self._current
-        if index is None or self._status[index] != "OK":
+        if index is None or self._status[index] != "OK" or not self.config.mapping.enabled:
             return timings
         if self._mapped != index:
             with _timed(timings, "mapping", self.device):
@@ -183,36 +195,11 @@ class Slam:
                 self._write_back(index, result.vector)
         return timings
 
-    def _track(self, index: int) -> TrackingResult:
-        arrays = self.scene.arrays()
-        starts = self._initial_poses()
-        result = self._tracker.track(arrays, self._images, index, starts[0])
-        if self._why_lost(result):
-            # Harder, and from the last pose as well: the constant-speed guess may be what failed.
-            effort = self.config.tracking.recovery_factor
-            tries = [self._tracker.track(arrays, self._images, index, start, effort=effort) for start in starts]
-            result = min(
-                [result, *tries], key=lambda r: (bool(self._why_lost(r)), r.depth_error / max(r.inliers, 1e-3))
-            )
-        return result
-
-    def _initial_poses(self) -> list[np.ndarray]:
-        """Where to start from: constant speed (if on and known), and the last pose."""
-        last = pose_from_vector(self._vectors[-1])
-        starts = [last]
-        recent = self._status[-2:]
-        if self.config.tracking.constant_speed and recent == ["OK", "OK"]:
-            before = pose_from_vector(self._vectors[-2])
-            starts.insert(0, last @ np.linalg.inv(before) @ last)
-        return starts
-
-    def _why_lost(self, tracked: TrackingResult) -> str:
-        config = self.config.tracking
-        if tracked.inliers < config.lost_inliers:
-            return f"only {tracked.inliers:.0%} of the depth rays agree with the map"
-        if not tracked.depth_error <= config.lost_depth_error:
-            return f"mean depth error {tracked.depth_error:.2f} m"
-        return ""
+    def forget_pose(self) -> None:
+        """The camera may be anywhere now: the next frame takes the pose that comes with it, or is looked for at the
+        keyframes.
+        """
+        self._first = len(self._vectors)
 
     def _is_keyframe(self, index: int) -> bool:
         config = self.config.keyframes
@@ -226,7 +213,7 @@ class Slam:
 
     def _map(self, index: int, depth: np.ndarray, first: bool) -> dict[str, float]:
         vector = self._vectors[index]
-        self.scene.cover(*self._extent(depth, pose_from_vector(vector)))
+        self.scene.cover(*measured_extent(depth, pose_from_vector(vector), self.intrinsics))
         if first:
             result = self._mapper.map_first(self._images, index, vector)
         else:
@@ -242,18 +229,6 @@ class Slam:
         self._vectors[index] = vector
         for keyframe in self.keyframes:
             self._vectors[keyframe.index] = keyframe.pose.copy()
-
-    def _extent(self, depth: np.ndarray, T_world_camera: np.ndarray, stride: int = 4) -> tuple[np.ndarray, np.ndarray]:
-        """Box of the camera and of everything it measures [m]."""
-        v, u = np.nonzero(depth[::stride, ::stride])
-        d = depth[::stride, ::stride][v, u].astype(np.float64)
-        camera = self.intrinsics
-        rays = np.stack(
-            [(u * stride - camera.cx) / camera.fx, (v * stride - camera.cy) / camera.fy, np.ones(len(u))], 1
-        )
-        points = (rays * d[:, None]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-        points = np.concatenate([points, T_world_camera[None, :3, 3]])
-        return points.min(axis=0), points.max(axis=0)
 
     # -- what came out -------------------------------------------------------------------------------------------
 
@@ -306,34 +281,59 @@ class Slam:
         """Operations of the field at a point, forward (see `warpslam.complexity`)."""
         return field_flops({decoder.level: decoder.hidden for decoder in self.scene.decoder_weights})["field"]
 
+    def memory(self) -> dict[str, float | None]:
+        """Bytes of the map's state, in all and per observed cubic metre; see `warpslam.memory.memory_report`."""
+        from warpslam.memory import memory_report
+
+        return memory_report(self)
+
     def save(self, path: str | Path) -> None:
-        """Write map, keyframes, trajectory and settings to one .npz file (no pickled code)."""
+        """Write map, keyframes, trajectory and settings to one file (plain arrays, no code)."""
         from warpslam.checkpoint import save_slam
 
         save_slam(self, Path(path))
 
     @classmethod
-    def load(cls, path: str | Path, device: str | None = None) -> Slam:
+    def load(
+        cls,
+        path: str | Path,
+        device: str | None = None,
+        *,
+        config: Config | None = None,
+        localize_only: bool = False,
+    ) -> Slam:
         """Read what `save` wrote; the result goes on from the last frame.
+
+        Args:
+            path: File.
+            device: As in `Slam`.
+            config: Settings from now on, those saved by default; the grids' spacings are the map's.
+            localize_only: The map stays as it is, and the camera may be anywhere in it: `mapping.enabled` is off, and
+                `forget_pose` was called.
 
         Raises:
             CheckpointError: the file is missing, damaged, or of another version.
+            ConfigError: ``config`` does not fit the map.
         """
         from warpslam.checkpoint import load_slam
 
-        return load_slam(Path(path), device)
+        return load_slam(Path(path), device, config=config, localize_only=localize_only)
 
     # -- frames in -----------------------------------------------------------------------------------------------
 
-    def _append(self, vector: np.ndarray, timestamp: float, status: str) -> None:
+    def _append(self, vector: np.ndarray, timestamp: float, status: str, depth_error: float = 0.0) -> None:
         self._vectors.append(vector)
         self._timestamps.append(timestamp)
         self._status.append(status)
+        self._depth_errors.append(depth_error)
+
+    def _last_pose(self) -> np.ndarray:
+        return pose_from_vector(self._vectors[-1]) if self._vectors else np.eye(4)
 
     def _skip(self, index: int, timestamp: float, message: str) -> FrameResult:
-        vector = self._vectors[-1].copy() if self._vectors else vector_from_pose(np.eye(4))
-        self._append(vector, timestamp, "SKIPPED")
-        return FrameResult(index, timestamp, pose_from_vector(vector), "SKIPPED", inliers=0.0, message=message)
+        pose = self._last_pose()
+        self._append(vector_from_pose(pose), timestamp, "SKIPPED")
+        return FrameResult(index, timestamp, pose, "SKIPPED", inliers=0.0, message=message)
 
 
 class _timed:
@@ -353,7 +353,7 @@ class _timed:
         self.phase.__exit__()
 
 
-def _check_image_size(camera: Intrinsics, config: Config) -> None:
+def _check_settings(camera: Intrinsics, config: Config) -> None:
     tracking = config.tracking
     if camera.width <= 2 * tracking.ignore_edge_u or camera.height <= 2 * tracking.ignore_edge_v:
         raise InputError(

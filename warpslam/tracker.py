@@ -48,15 +48,22 @@ class Tracker:
         self._thresholds = Thresholds(sampling.min_weight, sampling.min_gradient, sampling.min_transmittance)
 
     def track(
-        self, arrays: FieldArrays, images: ImagePool, frame: int, initial: np.ndarray, *, effort: int = 1
+        self,
+        arrays: FieldArrays,
+        images: ImagePool,
+        frame: int,
+        initial: np.ndarray,
+        *,
+        effort: int = 1,
+        iteration_factor: int = 1,
     ) -> TrackingResult:
         """Estimate the pose of frame ``frame``, starting from ``initial`` (4, 4); ``effort`` multiplies pixels and
-        iterations.
+        iterations, ``iteration_factor`` iterations alone.
         """
         config = self.config
         batch = self._batch if effort == 1 else self._new_batch(config.pixels * effort)
         start = vector_from_pose(initial)
-        visited = self._optimize(batch, arrays, images, frame, start, config.iterations * effort)
+        visited = self._optimize(batch, arrays, images, frame, start, config.iterations * effort * iteration_factor)
         candidates = [visited[-1]]
         if config.keep_best == "fixed_pixels":
             # Different pixels give different losses; only a comparison on the same ones means something.

@@ -28,7 +28,7 @@ def images(device):
         if slot == 0:
             pool.set(0, rgb, depth)
         else:
-            pool.add(rgb, depth)
+            assert pool.bring([pool.add(rgb, depth)]) == [slot]
         stored.append((rgb, depth))
     return pool, stored
 

@@ -75,7 +75,7 @@ class Imap(Baseline):
         self.network = ImapNetwork.random(seed, self._launcher)
         self.keyframes: list[Keyframe] = []
         self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
-        self._images = ImagePool(intrinsics, self.device)
+        self._images = ImagePool(intrinsics, self.device, self.config.keyframes.max_gigabytes)
         self._seen: list[SeenDepth] = []
         self._mapped: int | None = None
         self._current: int | None = None
@@ -118,8 +118,8 @@ class Imap(Baseline):
             synchronize(self.device)
             timings["mapping"] = time.perf_counter() - start
         if not self.keyframes or index - self.keyframes[-1].index >= self.config.keyframes.every:
-            slot = self._images.add(rgb, depth * np.float32(scale))
-            self.keyframes.append(Keyframe(index, slot, self._vectors[index].copy()))
+            image = self._images.add(rgb, depth * np.float32(scale))
+            self.keyframes.append(Keyframe(index, image, self._vectors[index].copy()))
         T = pose_from_vector(vector)
         return FrameResult(index, timestamp, T, "OK", values, inliers, depth_error, timings)
 
@@ -245,7 +245,7 @@ class Imap(Baseline):
             chosen = [others[n] for n in rng.permutation(len(others))[: max(size - 2, 0)]] + [last]
         vectors = [*(keyframe.pose for keyframe in chosen), self._vectors[index]]
         poses = np.stack([self._scaled(vector) for vector in vectors]).astype(np.float32)
-        slots = [*(keyframe.slot for keyframe in chosen), 0]
+        slots = [*self._images.bring([keyframe.image for keyframe in chosen]), 0]
         return wp.array(slots, dtype=int, device=self.device), wp.array(poses, dtype=float, device=self.device)
 
     def _uses(self, batch: ImapBatch) -> tuple:

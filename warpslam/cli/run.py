@@ -36,14 +36,20 @@ _PLAIN_LINES = 20
 def add(commands: Any) -> None:
     """Add both commands."""
     run = add_command(commands, "run", _run, "trajectory and coloured mesh of a folder of RGB-D frames")
-    run.add_argument("folder", metavar="FOLDER", help="folder of one sequence")
+    what = run.add_mutually_exclusive_group(required=True)
+    what.add_argument("folder", nargs="?", metavar="FOLDER", help="folder of one sequence")
+    what.add_argument("--resume", metavar="RUN", help="go on with a run that was stopped, from its last checkpoint")
     add_sequence_options(run)
     run.add_argument("--truth-mesh", metavar="FILE", help="true surface, for the reconstruction metrics")
+    run.add_argument("--map", metavar="FILE", help="start from the map of another run (its folder, or the file)")
+    run.add_argument("--localize", action="store_true", help="with --map: only track the camera, leave the map alone")
     _add_method_options(run)
+    _add_checkpoint_option(run)
     add_run_options(run)
 
     demo = add_command(commands, "demo", _demo, "SLAM in a small rendered room; needs no data")
     _add_method_options(demo)
+    _add_checkpoint_option(demo)
     add_run_options(demo)
 
 
@@ -54,19 +60,84 @@ def _add_method_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_checkpoint_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--checkpoint-every", type=int, metavar="N", help="write a checkpoint every N frames, for --resume"
+    )
+
+
 def _run(options: argparse.Namespace) -> int:
+    from warpslam.checkpoint import saved_config
     from warpslam.config import Config
+    from warpslam.errors import ConfigError
     from warpslam.pipeline import load_mesh
     from warpslam.revisit import open_source
-    from warpslam.run_folder import Source
+    from warpslam.run_folder import RunFolder, Source
 
     quiet_warp()
+    if options.resume is not None:
+        return _resume(options)
     path = str(Path(options.folder).expanduser().resolve())
     source = Source(path, options.dataset, options.camera, options.command_line)
     sequence = open_source(source)
-    config = Config.from_preset(options.preset or sequence.preset, options.overrides)
+    map_path = None
+    if options.map is not None:
+        if options.preset or options.decoders:
+            raise ConfigError("--preset and --decoders do not go with --map, which has both; use --set")
+        map_path = Path(options.map).expanduser().resolve()
+        map_path = RunFolder(map_path).map if map_path.is_dir() else map_path
+        config = saved_config(map_path).updated(options.overrides)
+    else:
+        config = Config.from_preset(options.preset or sequence.preset, options.overrides)
     truth_mesh = load_mesh(options.truth_mesh) if options.truth_mesh else None
-    return _execute(sequence, config, source, options, frames=options.frames, truth_mesh=truth_mesh)
+    return _execute(
+        sequence,
+        config,
+        source,
+        options,
+        frames=options.frames,
+        truth_mesh=truth_mesh,
+        map_path=map_path,
+        localize_only=options.localize,
+    )
+
+
+def _resume(options: argparse.Namespace) -> int:
+    """Everything is as the checkpoint says; an option that says otherwise is refused by the run."""
+    from warpslam.config import Config
+    from warpslam.errors import ConfigError
+    from warpslam.pipeline import load_mesh
+    from warpslam.resume import read_checkpoint
+    from warpslam.revisit import open_source
+    from warpslam.run_folder import RunFolder
+
+    for name in ("preset", "map", "localize", "output", "camera", "decoders"):
+        if getattr(options, name):
+            raise ConfigError(f"--{name} does not go with --resume: it is as when the run was started")
+    with warnings_on_stderr():
+        saved = read_checkpoint(RunFolder(options.resume))
+    request = saved.request
+    sequence = open_source(saved.source)
+    if options.truth_mesh:
+        truth_mesh = load_mesh(options.truth_mesh)
+    else:
+        truth_mesh = sequence.mesh if saved.source.path is None else None
+    options.output = options.resume
+    options.device = options.device or request.device
+    options.seed = options.seed or request.seed
+    options.poses = options.poses or request.poses
+    options.checkpoint_every = options.checkpoint_every or saved.checkpoint_every
+    return _execute(
+        sequence,
+        Config.from_dict(request.config).updated(options.overrides),
+        saved.source,
+        options,
+        frames=options.frames or slice(*request.frames),
+        truth_mesh=truth_mesh,
+        map_path=request.map,
+        localize_only=request.localize_only,
+        saved=saved,
+    )
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -102,6 +173,7 @@ def _execute(
             on_module=on_module,
             method=options.method,
             poses=options.poses,
+            checkpoint_every=options.checkpoint_every,
             **keywords,
         )
     _print_summary(result)

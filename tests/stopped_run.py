@@ -1,0 +1,52 @@
+"""``warpslam run`` in a process of its own that is killed at a chosen point, for the tests of checkpoints.
+
+    python -m tests.stopped_run POINT COUNT ARGUMENTS...
+
+kills itself (SIGKILL) when POINT is reached for the COUNT-th time: "map" (a frame), "write" (before a
+checkpoint is on the disk), "rename" (of a checkpoint), "refine" (after the last frame); "never" lets it run.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from warpslam import cli, pipeline
+from warpslam.mapper import Mapper
+
+
+def kill_at(owner: Any, name: str, count: int) -> None:
+    """Kill this process instead of the ``count``-th call of a function."""
+    function: Callable = getattr(owner, name)
+    calls = 0
+
+    def counted(*arguments: Any, **keywords: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls == count:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return function(*arguments, **keywords)
+
+    setattr(owner, name, counted)
+
+
+def main() -> int:
+    point, count, arguments = sys.argv[1], int(sys.argv[2]), sys.argv[3:]
+    targets = {
+        "map": (Mapper, "map_frame"),
+        "write": (os, "fsync"),
+        "rename": (Path, "replace"),
+        "refine": (Mapper, "refine"),
+    }
+    if point != "never":
+        kill_at(*targets[point], count)
+    pipeline._Run._draw_plots = lambda self: None  # figures take longer than all else
+    return cli.main(arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
