@@ -184,6 +184,11 @@ class Config(_Group):
     mapping: MappingConfig = Field(default_factory=MappingConfig)
     keyframes: KeyframeConfig = Field(default_factory=KeyframeConfig)
     meshing: MeshingConfig = Field(default_factory=MeshingConfig)
+    schedule: Literal["strict", "overlapped"] = Field(
+        "strict",
+        description="strict: mapping after tracking, runs repeat to the bit; overlapped: beside it, at most one mapping "
+        "interval behind",
+    )
     decoders: str | None = Field(None, description="decoder checkpoint; the package's own when empty")
 
     @classmethod

@@ -2,7 +2,7 @@
 
 An optimisation iteration reads
 
-    with wp.Tape() as tape:
+    with launcher.tape() as tape:
         batch.cast(poses)
         batch.bound(...); batch.place_samples(...)
         batch.render(arrays, "color", gradients, tape)
@@ -10,7 +10,7 @@ An optimisation iteration reads
     launcher.call(lambda: tape.backward(batch.loss))
 
 `RayBatch.cast` and the losses have generated adjoints; compositing and the decoders have hand-written ones, attached
-with `wp.Tape.record_func`. All launches go through a `warpslam.launching.Launcher`, which can record and replay them.
+with `Tape.record_func`. All launches go through a `warpslam.launching.Launcher`, which can record and replay them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from warpslam.camera import Intrinsics
 from warpslam.decoders import DecoderWeights
 from warpslam.kernels import adam, compositing, decoder, gauss_newton, losses, rays
 from warpslam.kernels.grid import Lattice, Vec32
-from warpslam.launching import Launcher, Step, decoders_for, run_slices, slice_count
+from warpslam.launching import Launcher, Step, Tape, decoders_for, run_slices, slice_count
 
 STAGES = ("coarse", "middle", "fine", "color")
 GROUP_SIZE = {"cpu": 8, "cuda": 16}
@@ -283,7 +283,7 @@ class RayBatch:
         self.keep.fill_(1)
 
     def cast(self, poses: wp.array, *, differentiate: bool = True) -> None:
-        """Rays of the pixels for pose vectors ``poses``, shape (frames, 7); recorded on an active tape."""
+        """Rays of the pixels for pose vectors ``poses``, shape (frames, 7); recorded on the launcher's tape."""
         inputs, outputs = [poses, self.frame, self.direction_camera], [self.origin, self.direction]
         if differentiate and poses.requires_grad:
             self.launcher.launch_taped(rays.cast_rays, self.count, inputs, outputs)
@@ -325,7 +325,7 @@ class RayBatch:
         arrays: FieldArrays,
         stage: str,
         gradients: Gradients | None = None,
-        tape: wp.Tape | None = None,
+        tape: Tape | None = None,
         *,
         thresholds: Thresholds = EXACT,
     ) -> None:
@@ -498,7 +498,7 @@ class RayBatch:
     # -- losses --------------------------------------------------------------------------------------------------
 
     def mapping_loss(self, color_weight: float, depth_weight: float = 1.0) -> None:
-        """Eq. 8-10; `loss` holds the sum. Recorded on an active tape."""
+        """Eq. 8-10; `loss` holds the sum. Recorded on the launcher's tape."""
         self.launcher.call(self.loss.zero_)
         inputs = [self.keep, self.measured_depth, self.measured_rgb, depth_weight, color_weight, self.depth, self.rgb]
         self.launcher.launch_taped(losses.mapping_loss, self.count, inputs, [self.loss])
@@ -515,7 +515,7 @@ class RayBatch:
         launch(losses.choose_inliers, self.count, [*inputs, self.inlier, self.counts[1:]])
 
     def tracking_loss(self, color_weight: float) -> None:
-        """Eq. 11-12 over the inliers; `loss` holds the sum. Recorded on an active tape."""
+        """Eq. 11-12 over the inliers; `loss` holds the sum. Recorded on the launcher's tape."""
         self.launcher.call(self.loss.zero_)
         inputs = [self.inlier, self.measured_depth, self.measured_rgb, self.sigma, 1.0, color_weight]
         self.launcher.launch_taped(losses.tracking_loss, self.count, [*inputs, self.depth, self.rgb], [self.loss])

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import lru_cache, partial
 from typing import Any
 
@@ -38,7 +39,31 @@ def slice_count(device: wp.Device) -> int:
 
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max_workers=MAX_SLICES - 1, thread_name_prefix="warpslam")
+    # Tracking and mapping may both run slices (`warpslam.scheduler`), and neither should queue behind the other.
+    return ThreadPoolExecutor(max_workers=2 * (MAX_SLICES - 1), thread_name_prefix="warpslam")
+
+
+class Tape:
+    """Backward passes of the launches of one `Launcher`, to be run in reverse.
+
+    A `wp.Tape` is the whole process's: it would take up what other threads launch meanwhile, and only one thread at a
+    time could have one. This one holds what its launcher was told to record and nothing else.
+    """
+
+    def __init__(self) -> None:
+        self._steps: list[Callable[[], Any]] = []
+
+    def record_func(self, backward: Callable[[], Any], arrays: Sequence[wp.array] = ()) -> None:
+        """Append a backward pass, which adds to the gradients of some inputs from those of the outputs ``arrays``."""
+        if any(array.grad is None for array in arrays):
+            raise ValueError("an output on the tape has no gradient: make it with requires_grad=True")
+        self._steps.append(backward)
+
+    def backward(self, loss: wp.array) -> None:
+        """Gradients of ``loss``, float (1,), by everything that it was computed from."""
+        loss.grad.fill_(1.0)
+        for step in reversed(self._steps):
+            step()
 
 
 class Launcher:
@@ -50,6 +75,7 @@ class Launcher:
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self._program: Program | None = None
+        self._tape: Tape | None = None
         self._kinds: dict[str, tuple[tuple, Program]] = {}
 
     def iterate(self, kind: str, uses: tuple, iteration: Callable[[], None]) -> None:
@@ -78,11 +104,34 @@ class Launcher:
         """One launch over ``dim`` threads."""
         self.call(self.command(kernel, dim, inputs).launch)
 
+    @contextmanager
+    def tape(self) -> Iterator[Tape]:
+        """A tape that is active within the ``with`` block: it gets the adjoints of this launcher's taped launches."""
+        self._tape = Tape()
+        try:
+            yield self._tape
+        finally:
+            self._tape = None
+
     def launch_taped(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
-        """A launch whose generated adjoint goes to the active `wp.Tape`, if there is one."""
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
-        if self._program is not None:
-            self._program.add(self.command(kernel, dim, inputs + outputs).launch)
+        """A launch whose generated adjoint goes to the active tape, if there is one; arguments are arrays and numbers.
+        """
+        self.launch(kernel, dim, inputs + outputs)
+        if self._tape is None:
+            return
+        gradients = ([getattr(argument, "grad", None) for argument in part] for part in (inputs, outputs))
+        adjoint = wp.launch(
+            kernel,
+            dim,
+            inputs,
+            outputs,
+            *gradients,
+            device=self.device,
+            adjoint=True,
+            record_cmd=True,
+            record_tape=False,
+        )
+        self._tape.record_func(adjoint.launch)
 
     def slices(self, count: int, steps: Callable[[int, int, int], list[Step]]) -> None:
         """Launches that work on rays (or rows) apart: ``steps(first, stop, slot)`` for each slice of ``count``."""
@@ -189,6 +238,6 @@ def compile_kernels(device: wp.Device) -> float:
 
 
 def synchronize(device: wp.Device) -> None:
-    """Wait for the device, so that wall-clock times mean something (nothing to do on the CPU)."""
+    """Wait for the device's current stream, so that wall-clock times mean something (nothing to do on the CPU)."""
     if device.is_cuda:
-        wp.synchronize_device(device)
+        wp.synchronize_stream(device)

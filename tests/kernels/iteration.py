@@ -13,6 +13,7 @@ from warpslam.decoders import DecoderWeights
 from warpslam.field import FieldArrays, Gradients, GridGradient, PackedDecoder, RayBatch, gradient_buffers
 from warpslam.kernels import decoder
 from warpslam.kernels.grid import Lattice, Vec32
+from warpslam.launching import Tape
 
 MAPPED_LEVELS = {
     "coarse": ("coarse",),
@@ -98,7 +99,7 @@ class Iteration:
         self.batch.bound(self.arrays)
         self.batch.place_samples(oracle.STRATIFIED_COUNT, oracle.SURFACE_COUNT, use_depth=self.stage != "coarse")
 
-    def render(self, gradients: Gradients | None = None, tape: wp.Tape | None = None) -> None:
+    def render(self, gradients: Gradients | None = None, tape: Tape | None = None) -> None:
         """Depth, colour and variance of the rays that are cast."""
         self.batch.render(self.arrays, self.stage, gradients, tape)
 
@@ -106,7 +107,7 @@ class Iteration:
         """Mapping loss and the gradient of everything that the stage has one for."""
         self.poses.grad.zero_()
         gradients = self._wanted(MAPPED_LEVELS[self.stage], points=self.stage != "coarse")
-        with wp.Tape() as tape:
+        with self.batch.launcher.tape() as tape:
             self.cast_and_sample()
             self.render(gradients, tape)
             self.batch.mapping_loss(0.2 if self.stage == "color" else 0.0)
@@ -121,7 +122,7 @@ class Iteration:
     def tracking(self, *, filter_factor: float = 10.0, median_includes_missing: bool = True) -> Gradient:
         """Tracking loss and the gradient of the poses alone."""
         self.poses.grad.zero_()
-        with wp.Tape() as tape:
+        with self.batch.launcher.tape() as tape:
             self.cast_and_sample()
             self.render(Gradients(points=True), tape)
             self.batch.choose_inliers(filter_factor, median_includes_missing=median_includes_missing)
