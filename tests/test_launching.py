@@ -1,4 +1,4 @@
-"""Launchers on two threads at a time: their tapes stay apart, and their slices share workers without waiting for ever."""
+"""Launchers on two threads at a time: their tapes stay apart, and their slices share workers without a deadlock."""
 
 import os
 import threading
@@ -58,7 +58,7 @@ def square(x: wp.array(dtype=float), factor: float, y: wp.array(dtype=float)):
 
 
 def test_tape_takes_up_its_own_launcher_only():
-    """Launches of other launchers, and those in no tape's block, leave no adjoint; the gradient of the rest is right."""
+    """Launches of other launchers, and those outside the block, leave no adjoint; the gradient of the rest is right."""
     device = wp.get_device("cpu")
     mine, other = Launcher(device), Launcher(device)
     x = wp.array([1.0, 2.0, 3.0], dtype=float, device=device, requires_grad=True)

@@ -20,8 +20,8 @@ from warpslam.mapper import Mapper
 from warpslam.meshing import ObservedView, extract_mesh
 from warpslam.relocalization import Localizer, Track
 from warpslam.rendering import RenderedImage, render_image
-from warpslam.scheduler import MappingTask, new_scheduler
 from warpslam.scene import SceneMap
+from warpslam.scheduler import MappingTask, new_scheduler
 from warpslam.tracker import Tracker
 from warpslam.trajectory import Trajectory
 
