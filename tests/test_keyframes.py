@@ -82,4 +82,3 @@ def test_compact_images_are_smaller_and_exact():
     bomb = CompactImage(zlib.compress(bytes(10**7)), image.depth, 1.0)
     with pytest.raises(ValueError, match="compressed image"):
         bomb.unpack(CAMERA)
-

@@ -97,7 +97,7 @@ def test_waiting_after_every_frame_equals_strict(frames):
 
 
 def test_tracking_goes_on_while_the_mapper_works(frames, gated):
-    """A frame is tracked against the map as it was last taken over, whatever the mapper does meanwhile."""
+    """A frame is tracked against the map as it was last taken over, and the mapper maps the frame it was given."""
     slam, gate = gated
     step(slam, frames[1])
     step(slam, frames[2])
@@ -110,6 +110,12 @@ def test_tracking_goes_on_while_the_mapper_works(frames, gated):
     gate.open.set()
     slam.wait()
     assert slam._scheduler.version == 2
+    waited = new_slam()
+    for frame in frames[:3]:
+        step(waited, frame)
+        waited.wait()
+    for level, values in features(waited).items():
+        np.testing.assert_array_equal(slam.scene.grids[level].features.numpy(), values)
     assert not np.array_equal(slam.scene.grids["middle"].features.numpy(), before["middle"])
 
 

@@ -24,6 +24,7 @@ from benchmarking.torch_slam import Level, TorchSlam
 
 from warpslam.camera import Intrinsics, vector_from_pose
 from warpslam.config import Config
+from warpslam.frustum import measured_extent
 from warpslam.slam import Slam
 from warpslam.synthetic import SyntheticSequence
 
@@ -44,7 +45,7 @@ class Ours:
         for frame in self.frames[:5]:
             self.slam.step(frame.rgb, frame.depth, T_world_camera=frame.T_world_camera)
         last = self.frames[5]
-        self.slam.scene.cover(*self.slam._extent(last.depth, last.T_world_camera))
+        self.slam.scene.cover(*measured_extent(last.depth, last.T_world_camera, self.slam.intrinsics))
         self.slam._images.set(0, last.rgb, last.depth)
         self.vector = vector_from_pose(last.T_world_camera)
 

@@ -149,10 +149,10 @@ def slam_from_state(
 
     slam.scene.restore_bounds(*state.array("bounds", np.float64, (2, 3)).copy())
     for level, grid in slam.scene.grids.items():
-        shape = state.array(f"grid_{level}_shape", np.int64, (3,))
+        nx, ny, nz = state.array(f"grid_{level}_shape", np.int64, (3,)).tolist()
         first = state.array(f"grid_{level}_first", np.int64, (3,))
-        rows = int(np.prod(shape.astype(object)))
-        grid.restore(first.copy(), shape, state.array(f"grid_{level}", np.float32, (rows, 32)))
+        features = state.array(f"grid_{level}", np.float32, (nx * ny * nz, 32))
+        grid.restore(first.copy(), (nx, ny, nz), features)
 
     size = (camera.height, camera.width)
     frames = state.frames("keyframes", count)

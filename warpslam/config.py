@@ -186,8 +186,8 @@ class Config(_Group):
     meshing: MeshingConfig = Field(default_factory=MeshingConfig)
     schedule: Literal["strict", "overlapped"] = Field(
         "strict",
-        description="strict: mapping after tracking, runs repeat to the bit; overlapped: beside it, the map at most one "
-        "mapping interval behind",
+        description="strict: mapping after tracking, runs repeat to the bit; overlapped: beside it, and the map is at "
+        "most one mapping interval behind",
     )
     decoders: str | None = Field(None, description="decoder checkpoint; the package's own when empty")
 

@@ -1,4 +1,4 @@
-"""Frustum feature selection (A.1): the grid vertices that one frame may change."""
+"""What one frame sees: the box of its measurements, and the grid vertices that it may change (A.1)."""
 
 from __future__ import annotations
 
@@ -51,3 +51,22 @@ def select_in_frustum(
         record_tape=False,
     )
     return selected.numpy() != 0
+
+
+def measured_extent(
+    depth: np.ndarray, T_world_camera: np.ndarray, camera: Intrinsics, stride: int = 4
+) -> tuple[np.ndarray, np.ndarray]:
+    """Box of the camera and of everything it measures [m]: lower and upper corner, float64 (3,) each.
+
+    Args:
+        depth: Depth image [m], (H, W), 0 = missing.
+        T_world_camera: Pose (4, 4).
+        camera: Intrinsics of the image.
+        stride: Rows and columns from one pixel looked at to the next.
+    """
+    v, u = np.nonzero(depth[::stride, ::stride])
+    d = depth[::stride, ::stride][v, u].astype(np.float64)
+    rays = np.stack([(u * stride - camera.cx) / camera.fx, (v * stride - camera.cy) / camera.fy, np.ones(len(u))], 1)
+    points = (rays * d[:, None]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    points = np.concatenate([points, T_world_camera[None, :3, 3]])
+    return points.min(axis=0), points.max(axis=0)

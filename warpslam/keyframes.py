@@ -52,7 +52,7 @@ class ImagePool:
 
     def fork(self) -> ImagePool:
         """A pool with slots of its own that shares the kept images, also those added later: for another thread."""
-        other = ImagePool(self.camera, self.device)
+        other = ImagePool(self.camera, self.device, capacity=self.rgb.shape[0])
         other.max_slots, other.images = self.max_slots, self.images
         return other
 

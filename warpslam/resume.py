@@ -212,7 +212,7 @@ def frame_digest(frame: Frame) -> str:
     """SHA-256 of a frame's images and time."""
     digest = hashlib.sha256(repr(float(frame.timestamp)).encode())
     for image in (frame.rgb, frame.depth):
-        digest.update(np.ascontiguousarray(image))
+        digest.update(np.ascontiguousarray(image).data)
     return digest.hexdigest()
 
 
@@ -228,9 +228,7 @@ def _saved_run(path: str, header: dict[str, Any], arrays: dict[str, np.ndarray])
             position=int(run["position"]),
             frame_indices=[int(index) for index in run["frame_indices"]],
             truth_poses=list(truth.reshape(-1, 4, 4)),
-            results=[
-                FrameResult(T_world_camera=pose, **row) for pose, row in zip(poses, run["results"], strict=True)
-            ],
+            results=[FrameResult(T_world_camera=pose, **row) for pose, row in zip(poses, run["results"], strict=True)],
             unreadable_count=int(run["unreadable_count"]),
             seconds={str(name): float(seconds) for name, seconds in run["seconds"].items()},
             first_index=int(run["first_index"]),

@@ -14,6 +14,7 @@ from warpslam.camera import Intrinsics, check_transform, pose_from_vector, vecto
 from warpslam.config import Config
 from warpslam.decoders import Decoders, load_decoders
 from warpslam.errors import InputError
+from warpslam.frustum import measured_extent
 from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth, check_window_fits
 from warpslam.launching import compile_kernels, synchronize
 from warpslam.mapper import Mapper
@@ -38,10 +39,10 @@ class FrameResult:
     index: Frame number from 0. timestamp: [s].
     T_world_camera: Estimated pose, float64 (4, 4); of a frame that is not OK, that of the last one that was.
     status: "OK"; "LOST" (the pose was not found, the map is untouched); "SKIPPED" (nothing usable in the frame).
-    losses: Mean loss per ray: "tracking", and of the mapping stages that ran.
+    losses: Mean loss per ray: "tracking", and of the stages of mapping that was done by then.
     inliers: Share of the depth rays that agree with the map, in [0, 1].
     depth_error: Mean |measured - rendered depth| of the inliers [m].
-    timings: Seconds by phase: "tracking", "mapping", "keyframe".
+    timings: Seconds by phase: "tracking", "mapping" (overlapped: waiting for it and taking it over), "keyframe".
     message: Why the frame is not OK.
     """
 
@@ -69,7 +70,8 @@ class Slam:
         intrinsics: Camera of all frames.
         config: Settings, `Config()` by default.
         device: Warp device, "cpu" or "cuda:0"; by default CUDA where there is one.
-        seed: Of the initial features and of every random choice. Same input, seed and device: same result.
+        seed: Of the initial features and of every random choice. Same input, seed and device: same result (with the
+            strict schedule).
         decoders: Decoder weights; by default those of `Config.decoders`, and failing that the package's own.
     """
 
@@ -219,7 +221,7 @@ class Slam:
         """Have a frame mapped, after the one before; returns the losses of what is done by now."""
         losses = self._take_over(wait=True)
         vector = self._vectors[index]
-        extent = self._extent(depth, pose_from_vector(vector))
+        extent = measured_extent(depth, pose_from_vector(vector), self.intrinsics)
         self._scheduler.start(MappingTask("first" if first else "frame", index, vector, extent), self.keyframes)
         self._seen.append(SeenDepth.of(index, depth))
         return {**losses, **self._take_over(wait=first)}
@@ -240,18 +242,6 @@ class Slam:
         self._vectors[index] = vector
         for keyframe in self.keyframes:
             self._vectors[keyframe.index] = keyframe.pose.copy()
-
-    def _extent(self, depth: np.ndarray, T_world_camera: np.ndarray, stride: int = 4) -> tuple[np.ndarray, np.ndarray]:
-        """Box of the camera and of everything it measures [m]."""
-        v, u = np.nonzero(depth[::stride, ::stride])
-        d = depth[::stride, ::stride][v, u].astype(np.float64)
-        camera = self.intrinsics
-        rays = np.stack(
-            [(u * stride - camera.cx) / camera.fx, (v * stride - camera.cy) / camera.fy, np.ones(len(u))], 1
-        )
-        points = (rays * d[:, None]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-        points = np.concatenate([points, T_world_camera[None, :3, 3]])
-        return points.min(axis=0), points.max(axis=0)
 
     # -- what came out -------------------------------------------------------------------------------------------
 

@@ -186,4 +186,4 @@ def _little_endian(array: np.ndarray) -> np.ndarray:
 
 
 def _bytes(array: np.ndarray) -> memoryview:
-    return memoryview(array.reshape(-1)).cast("B") if array.size else memoryview(b"")
+    return array.reshape(-1).data.cast("B") if array.size else memoryview(b"")
