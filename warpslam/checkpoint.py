@@ -55,6 +55,7 @@ def saved_config(path: Path) -> Config:
 
 def slam_state(slam: Slam) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays; on the CPU the large ones are views of the map, not copies."""
+    slam.wait()
     header = {
         "seed": slam.seed,
         "device": "cuda" if slam.device.is_cuda else "cpu",

@@ -2,7 +2,7 @@
 
 An optimisation iteration reads
 
-    with wp.Tape() as tape:
+    with launcher.tape() as tape:
         batch.cast(poses)
         batch.bound(...); batch.place_samples(...)
         batch.render(arrays, "color", gradients, tape)
@@ -283,7 +283,7 @@ class RayBatch:
         self.keep.fill_(1)
 
     def cast(self, poses: wp.array, *, differentiate: bool = True) -> None:
-        """Rays of the pixels for pose vectors ``poses``, shape (frames, 7); recorded on an active tape."""
+        """Rays of the pixels for pose vectors ``poses``, shape (frames, 7); recorded on the launcher's tape."""
         inputs, outputs = [poses, self.frame, self.direction_camera], [self.origin, self.direction]
         if differentiate and poses.requires_grad:
             self.launcher.launch_taped(rays.cast_rays, self.count, inputs, outputs)
@@ -506,7 +506,7 @@ class RayBatch:
     # -- losses --------------------------------------------------------------------------------------------------
 
     def mapping_loss(self, color_weight: float, depth_weight: float = 1.0) -> None:
-        """Eq. 8-10; `loss` holds the sum. Recorded on an active tape."""
+        """Eq. 8-10; `loss` holds the sum. Recorded on the launcher's tape."""
         self.launcher.call(self.loss.zero_)
         inputs = [self.keep, self.measured_depth, self.measured_rgb, depth_weight, color_weight, self.depth, self.rgb]
         self.launcher.launch_taped(losses.mapping_loss, self.count, inputs, [self.loss])
@@ -523,7 +523,7 @@ class RayBatch:
         launch(losses.choose_inliers, self.count, [*inputs, self.inlier, self.counts[1:]])
 
     def tracking_loss(self, color_weight: float) -> None:
-        """Eq. 11-12 over the inliers; `loss` holds the sum. Recorded on an active tape."""
+        """Eq. 11-12 over the inliers; `loss` holds the sum. Recorded on the launcher's tape."""
         self.launcher.call(self.loss.zero_)
         inputs = [self.inlier, self.measured_depth, self.measured_rgb, self.sigma, 1.0, color_weight]
         self.launcher.launch_taped(losses.tracking_loss, self.count, [*inputs, self.depth, self.rgb], [self.loss])

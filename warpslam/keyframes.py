@@ -50,6 +50,17 @@ class ImagePool:
         """Colour (slots, H, W, 3), depth (slots, H, W) and its scale (slots,) as the kernels read them."""
         return self.rgb, self.depth, self.scale
 
+    def fork(self) -> ImagePool:
+        """A pool with slots of its own that shares the kept images, also those added later: for another thread."""
+        other = ImagePool(self.camera, self.device, capacity=self.rgb.shape[0])
+        other.max_slots, other.images = self.max_slots, self.images
+        return other
+
+    def copy_current(self, other: ImagePool) -> None:
+        """Put into slot 0 what the other pool holds there."""
+        for target, source in zip(self.arrays, other.arrays, strict=True):
+            wp.copy(target, source, count=source.size // source.shape[0])
+
     def set(self, slot: int, rgb: np.ndarray, depth: np.ndarray) -> None:
         """Store an image: uint8 (H, W, 3) and float32 (H, W) [m]."""
         self._write(slot, rgb, *_quantized(depth))

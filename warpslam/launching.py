@@ -9,8 +9,9 @@ order in every run.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import lru_cache, partial
 from typing import Any
 
@@ -37,7 +38,8 @@ def slice_count(device: wp.Device) -> int:
 
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max_workers=MAX_SLICES - 1, thread_name_prefix="warpslam")
+    # Tracking and mapping may both run slices (`warpslam.scheduler`), and neither should queue behind the other.
+    return ThreadPoolExecutor(max_workers=2 * (MAX_SLICES - 1), thread_name_prefix="warpslam")
 
 
 class Launcher:
@@ -49,6 +51,7 @@ class Launcher:
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self._program: Program | None = None
+        self._tape: wp.Tape | None = None
         self._kinds: dict[str, tuple[tuple, Program]] = {}
 
     def iterate(self, kind: str, uses: tuple, iteration: Callable[[], None]) -> None:
@@ -77,11 +80,37 @@ class Launcher:
         """One launch over ``dim`` threads."""
         self.call(self.command(kernel, dim, inputs).launch)
 
+    @contextmanager
+    def tape(self) -> Iterator[wp.Tape]:
+        """A `wp.Tape` that gets the adjoints of this launcher's taped launches within the ``with`` block.
+
+        It is never entered itself: an entered tape is the whole process's, and would take up what other threads launch.
+        """
+        self._tape = wp.Tape()
+        try:
+            yield self._tape
+        finally:
+            self._tape = None
+
     def launch_taped(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
-        """A launch whose generated adjoint goes to the active `wp.Tape`, if there is one."""
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
-        if self._program is not None:
-            self._program.add(self.command(kernel, dim, inputs + outputs).launch)
+        """A launch whose generated adjoint goes to the active tape, if there is one; arguments are arrays and numbers.
+        """
+        self.launch(kernel, dim, inputs + outputs)
+        if self._tape is None:
+            return
+        gradients = ([getattr(argument, "grad", None) for argument in part] for part in (inputs, outputs))
+        adjoint = wp.launch(
+            kernel,
+            dim,
+            inputs,
+            outputs,
+            *gradients,
+            device=self.device,
+            adjoint=True,
+            record_cmd=True,
+            record_tape=False,
+        )
+        self._tape.record_func(adjoint.launch, [array for array in outputs if array.requires_grad])
 
     def slices(self, count: int, steps: Callable[[int, int, int], list[Step]]) -> None:
         """Launches that work on rays (or rows) apart: ``steps(first, stop, slot)`` for each slice of ``count``."""
@@ -177,6 +206,6 @@ def decoders_for(device: wp.Device):
 
 
 def synchronize(device: wp.Device) -> None:
-    """Wait for the device, so that wall-clock times mean something (nothing to do on the CPU)."""
+    """Wait for the device's current stream, so that wall-clock times mean something (nothing to do on the CPU)."""
     if device.is_cuda:
-        wp.synchronize_device(device)
+        wp.synchronize_stream(device)

@@ -14,7 +14,7 @@ import warp as wp
 
 from warpslam.camera import Intrinsics, pose_from_vector, vector_from_pose
 from warpslam.config import MappingConfig, SamplingConfig
-from warpslam.field import Gradients, RayBatch, Thresholds
+from warpslam.field import STAGES, Gradients, RayBatch, Thresholds
 from warpslam.frustum import select_in_frustum
 from warpslam.keyframes import ImagePool, Keyframe, overlap_fractions
 from warpslam.launching import Launcher
@@ -52,7 +52,10 @@ class MappingResult:
 
 
 class Mapper:
-    """Optimises a `SceneMap` from the current frame and selected keyframes."""
+    """Optimises a `SceneMap` from the current frame and selected keyframes.
+
+    scene: The map it optimises.
+    """
 
     def __init__(
         self,
@@ -71,18 +74,32 @@ class Mapper:
         self._poses = PoseOptimizer(2 * config.window + 2, self._launcher)
         samples = sampling.stratified + sampling.surface
         self._batch = RayBatch(config.pixels, samples, device, self._launcher)
+        self._losses = wp.zeros(len(STAGES), dtype=float, device=device)
+        self._changed: set[str] = set()
 
     def map_first(
         self, images: ImagePool, frame: int, vector: np.ndarray, on_iteration: Callable | None = None
     ) -> MappingResult:
         """The first frame: many iterations at higher rates."""
+        return self.start_first(images, frame, vector, on_iteration)()
+
+    def map_frame(self, images: ImagePool, frame: int, vector: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
+        """A later frame: window, frustum selection, three stages, bundle adjustment once there are enough keyframes."""
+        return self.start_frame(images, frame, vector, keyframes)()
+
+    def start_first(
+        self, images: ImagePool, frame: int, vector: np.ndarray, on_iteration: Callable | None = None
+    ) -> Callable[[], MappingResult]:
+        """`map_first` without waiting for the device: the function that is returned waits, and reads the outcome."""
         config = self.config
         return self._optimize(
             images, frame, vector, [], config.first_iterations, config.first_rate_factor, on_iteration=on_iteration
         )
 
-    def map_frame(self, images: ImagePool, frame: int, vector: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
-        """A later frame: window, frustum selection, three stages, bundle adjustment once there are enough keyframes."""
+    def start_frame(
+        self, images: ImagePool, frame: int, vector: np.ndarray, keyframes: list[Keyframe]
+    ) -> Callable[[], MappingResult]:
+        """`map_frame` without waiting for the device: the function that is returned waits, and reads the outcome."""
         return self._optimize(images, frame, vector, keyframes, self.config.iterations, 1.0)
 
     def refine(self, images: ImagePool, frame: int, vector: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
@@ -93,8 +110,12 @@ class Mapper:
         for round_ in range(self.config.refinement_rounds):
             result = self._optimize(
                 images, frame, result.vector, keyframes, self.config.iterations, 1.0, refinement=True, round_=round_
-            )
+            )()
         return result
+
+    def changed_rows(self) -> dict[str, wp.array]:
+        """Rows of each level that the last call may have changed, int (n,); levels it left alone are absent."""
+        return {level: self._grids[level].rows for level in self._changed}
 
     # -- one call ------------------------------------------------------------------------------------------------
 
@@ -110,7 +131,8 @@ class Mapper:
         refinement: bool = False,
         round_: int = 0,
         on_iteration: Callable | None = None,
-    ) -> MappingResult:
+    ) -> Callable[[], MappingResult]:
+        """Launch a whole call; what is returned reads its outcome."""
         config = self.config
         rng = np.random.default_rng([self.seed, 2, frame, round_])
         size = config.window * (2 if refinement else 1)
@@ -129,7 +151,7 @@ class Mapper:
         in_use = images.bring([keyframe.image for keyframe in (*window, *coarse)])
         slots = wp.array([*in_use[: len(window)], 0], dtype=int, device=self.device)
         self._select(images, vector, everything=refinement)
-        result = MappingResult(vector, window=[keyframe.index for keyframe in window], adjusted=adjust)
+        ray_counts: dict[str, int] = {}
         self._launcher.forget()
 
         if config.coarse and not refinement:
@@ -137,7 +159,8 @@ class Mapper:
             poses = np.stack([*(keyframe.pose for keyframe in coarse), vector]).astype(np.float32)
             coarse_poses = wp.array(poses, dtype=float, device=self.device)
             count = config.first_iterations if not keyframes and rate_factor != 1.0 else config.coarse_iterations
-            self._run_coarse(images, frame, coarse_slots, coarse_poses, count, rate_factor, result)
+            self._run_coarse(images, frame, coarse_slots, coarse_poses, count, rate_factor)
+            self._note_loss("coarse", ray_counts)
 
         stages = self._schedule(iterations, refinement)
         self._batch.set_seeds([ray_seed(self.seed, 3, frame, n, round_) for n in range(len(stages))])
@@ -149,18 +172,26 @@ class Mapper:
             self._launcher.iterate(stage, (), iterate)
             last_of_stage = iteration + 1 == len(stages) or stages[iteration + 1] != stage
             if last_of_stage:
-                result.losses[stage] = self._mean_loss()
+                self._note_loss(stage, ray_counts)
             if on_iteration is not None:
                 on_iteration(stage, iteration, len(stages))
-        for name, optimizer in (*self._grids.items(), ("colour decoder", self._decoder)):
-            if optimizer.has_rejected:
-                _log.warning("frame %d: gradients of the %s were not finite and have been left out", frame, name)
-        if adjust:
-            vectors = self._poses.vectors()
-            for keyframe, refined in zip(window[1:], vectors[1:-1], strict=True):
-                keyframe.pose = _normalized(refined)
-            result.vector = _normalized(vectors[-1])
-        return result
+        self._changed = {level for stage in ray_counts for level in _STAGE_LEVELS[stage]}
+
+        def outcome() -> MappingResult:
+            for name, optimizer in (*self._grids.items(), ("colour decoder", self._decoder)):
+                if optimizer.has_rejected:
+                    _log.warning("frame %d: gradients of the %s were not finite and have been left out", frame, name)
+            result = MappingResult(vector, window=[keyframe.index for keyframe in window], adjusted=adjust)
+            losses = self._losses.numpy()
+            result.losses = {s: float(losses[STAGES.index(s)]) / max(count, 1) for s, count in ray_counts.items()}
+            if adjust:
+                vectors = self._poses.vectors()
+                for keyframe, refined in zip(window[1:], vectors[1:-1], strict=True):
+                    keyframe.pose = _normalized(refined)
+                result.vector = _normalized(vectors[-1])
+            return result
+
+        return outcome
 
     def _schedule(self, iterations: int, refinement: bool) -> list[str]:
         """Stage of each iteration; both comparisons are inclusive, as in the released code."""
@@ -217,7 +248,7 @@ class Mapper:
             color_weights=self._decoder.gradient if train_decoder else None,
         )
         sampling = self.sampling
-        with wp.Tape() as tape:
+        with self._launcher.tape() as tape:
             batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera)
             batch.cast(self._poses.poses, differentiate=gradients.points)
             batch.bound(arrays)
@@ -258,7 +289,6 @@ class Mapper:
         poses: wp.array,
         iterations: int,
         rate_factor: float,
-        result: MappingResult,
     ) -> None:
         """Coarse stage: no depth guidance, depth loss only, all vertices."""
         config, batch, arrays, sampling = self.config, self._batch, self.scene.arrays(), self.sampling
@@ -266,7 +296,7 @@ class Mapper:
         gradients = Gradients(grids={"coarse": optimizer.wanted()})
 
         def iterate() -> None:
-            with wp.Tape() as tape:
+            with self._launcher.tape() as tape:
                 batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera)
                 batch.cast(poses)
                 batch.bound(arrays, use_depth=False)
@@ -280,10 +310,11 @@ class Mapper:
         batch.set_seeds([ray_seed(self.seed, 4, frame, n) for n in range(iterations)])
         for _ in range(iterations):
             self._launcher.iterate("coarse", (), iterate)
-        result.losses["coarse"] = self._mean_loss()
 
-    def _mean_loss(self) -> float:
-        return float(self._batch.loss.numpy()[0]) / max(self._batch.count, 1)
+    def _note_loss(self, stage: str, ray_counts: dict[str, int]) -> None:
+        """Keep the loss of the last iteration on the device until the end of the call."""
+        ray_counts[stage] = self._batch.count
+        wp.copy(self._losses, self._batch.loss, dest_offset=STAGES.index(stage), count=1)
 
 
 def _normalized(vector: np.ndarray) -> np.ndarray:

@@ -80,6 +80,14 @@ class FeatureGrid:
         self.lattice = self._lattice()
         self.features = wp.array(np.ascontiguousarray(features, np.float32), dtype=Vec32, device=self.device)
 
+    def update_from(self, other: FeatureGrid, rows: wp.array | None) -> None:
+        """Take over the extent of another grid of this level, and some of its rows: int (n,), None for none."""
+        if other.shape != self.shape or (other.first != self.first).any():
+            self._resize(other.first, other.shape)
+        if rows is not None:
+            inputs = [rows, other.features, self.features]
+            wp.launch(grid_kernels.copy_rows, rows.shape[0], inputs, device=self.device, record_tape=False)
+
     def _lattice(self) -> Lattice:
         lattice = Lattice()
         lattice.origin = wp.vec3(*(self.first * self.spacing))
@@ -95,7 +103,7 @@ class SceneMap:
     """
 
     def __init__(self, decoders: Decoders, config: GridConfig, device: wp.Device, seed: int = 0) -> None:
-        self.config, self.device, self.decoder_weights = config, device, decoders
+        self.config, self.device, self.decoder_weights, self.seed = config, device, decoders, seed
         self.grids = {
             level: FeatureGrid(
                 level, getattr(config, f"{level}_spacing"), getattr(config, f"{level}_std"), seed, device
@@ -105,7 +113,28 @@ class SceneMap:
         self.decoders = {weights.level: PackedDecoder(weights, device) for weights in decoders}
         self.low = np.zeros(3)
         self.high = np.zeros(3)
+        self._buffers = 1
         self._queries: RayBatch | None = None
+
+    def copy(self) -> SceneMap:
+        """The same map in arrays of its own, which is meant to exist beside this one."""
+        other = SceneMap(self.decoder_weights, self.config, self.device, self.seed)
+        for level, grid in self.grids.items():
+            other.grids[level].restore(grid.first, grid.shape, grid.features.numpy())
+        other.update_from(self, {})
+        other._buffers = 1 + self._buffers
+        return other
+
+    def update_from(self, other: SceneMap, rows: dict[str, wp.array]) -> None:
+        """Take over what changed in ``other``, a map of the same seed: its bounds, the colour decoder, and ``rows`` of
+        each level (int, indices into the other's grid). New vertices start alike in both maps.
+        """
+        self.low, self.high = other.low, other.high
+        for level, grid in self.grids.items():
+            grid.update_from(other.grids[level], rows.get(level))
+        mine, theirs = self.decoders["color"], other.decoders["color"]
+        wp.copy(mine.weights, theirs.weights)
+        wp.copy(mine.transposed, theirs.transposed)
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -160,7 +189,7 @@ class SceneMap:
 
     def gigabytes(self, low: np.ndarray, high: np.ndarray) -> float:
         """Memory of the grids over a box, with both Adam moments and the gradient buffers [GB]."""
-        arrays = 3 + slice_count(self.device)
+        arrays = 2 + self._buffers + slice_count(self.device)
         rows = sum(float(np.prod((high - low) / grid.spacing + 2)) for grid in self.grids.values())
         return rows * 32 * 4 * arrays / 1e9
 

@@ -26,6 +26,7 @@ from warpslam.profiling import phase
 from warpslam.relocalization import Localizer, Track
 from warpslam.rendering import RenderedImage, render_image
 from warpslam.scene import SceneMap
+from warpslam.scheduler import MappingTask, new_scheduler
 from warpslam.tracker import Tracker
 from warpslam.trajectory import Trajectory
 
@@ -42,10 +43,10 @@ class FrameResult:
     index: Frame number from 0. timestamp: [s].
     T_world_camera: Estimated pose, float64 (4, 4); of a frame that is not OK, that of the last one that was.
     status: "OK"; "LOST" (the pose was not found, the map is untouched); "SKIPPED" (nothing usable in the frame).
-    losses: Mean loss per ray: "tracking", and of the mapping stages that ran.
+    losses: Mean loss per ray: "tracking", and of the stages of mapping that was done by then.
     inliers: Share of the depth rays that agree with the map, in [0, 1].
     depth_error: Mean |measured - rendered depth| of the inliers [m].
-    timings: Seconds by phase: "tracking", "mapping", "keyframe".
+    timings: Seconds by phase: "tracking", "mapping" (overlapped: waiting for it and taking it over), "keyframe".
     message: Why the frame is not OK.
     """
 
@@ -73,7 +74,8 @@ class Slam:
         intrinsics: Camera of all frames.
         config: Settings, `Config()` by default.
         device: Warp device, "cpu" or "cuda:0"; by default CUDA where there is one.
-        seed: Of the initial features and of every random choice. Same input, seed and device: same result.
+        seed: Of the initial features and of every random choice. Same input, seed and device: same result (with the
+            strict schedule).
         decoders: Decoder weights; by default those of `Config.decoders`, and failing that the package's own.
     """
 
@@ -101,6 +103,7 @@ class Slam:
         self._tracker = Tracker(intrinsics, self.config.tracking, self.config.sampling, self.device, seed)
         self._localizer = Localizer(self._tracker, self.config.tracking, intrinsics)
         self._mapper = Mapper(self.scene, intrinsics, self.config.mapping, self.config.sampling, self.device, seed)
+        self._scheduler = new_scheduler(self.config.schedule, self._mapper, self._images)
         self._vectors: list[np.ndarray] = []
         self._timestamps: list[float] = []
         self._status: list[str] = []
@@ -145,10 +148,13 @@ class Slam:
         if np.count_nonzero(depth) < MIN_DEPTH_PIXELS:
             return self._skip(index, timestamp, f"fewer than {MIN_DEPTH_PIXELS} pixels have depth")
 
-        self._images.set(0, rgb, depth)
-        self._current = index
         timings: dict[str, float] = {}
         losses: dict[str, float] = {}
+        if self._scheduler.has_finished:
+            with _timed(timings, "mapping", self.device):
+                losses.update(self._take_over())
+        self._images.set(0, rgb, depth)
+        self._current = index
         status, message, inliers, depth_error = "OK", "", 1.0, 0.0
         first = self.scene.is_empty
         if first and not self.config.mapping.enabled:
@@ -182,6 +188,7 @@ class Slam:
         """After the last frame: map it if it was not, then refine the whole map (Sec. 3.1). Returns the seconds by
         phase.
         """
+        self.wait()
         timings: dict[str, float] = {}
         index = self._current
         if index is None or self._status[index] != "OK" or not self.config.mapping.enabled:
@@ -189,11 +196,16 @@ class Slam:
         if self._mapped != index:
             with _timed(timings, "mapping", self.device):
                 self._map(index, self._images.depth_image(0), first=False)
+                self.wait()
         if self.config.mapping.color_refinement and self.keyframes:
             with _timed(timings, "refinement", self.device):
-                result = self._mapper.refine(self._images, index, self._vectors[index], self.keyframes)
-                self._write_back(index, result.vector)
+                self._scheduler.start(MappingTask("refinement", index, self._vectors[index]), self.keyframes)
+                self.wait()
         return timings
+
+    def wait(self) -> None:
+        """Until every frame that was to be mapped is in the map (at once, unless `Config.schedule` is overlapped)."""
+        self._take_over(wait=True)
 
     def forget_pose(self) -> None:
         """The camera may be anywhere now: the next frame takes the pose that comes with it, or is looked for at the
@@ -212,16 +224,23 @@ class Slam:
         return self._tracker.explained_share(config.known_error) < config.known_share
 
     def _map(self, index: int, depth: np.ndarray, first: bool) -> dict[str, float]:
+        """Have a frame mapped, after the one before; returns the losses of what is done by now."""
+        losses = self._take_over(wait=True)
         vector = self._vectors[index]
-        self.scene.cover(*measured_extent(depth, pose_from_vector(vector), self.intrinsics))
-        if first:
-            result = self._mapper.map_first(self._images, index, vector)
-        else:
-            result = self._mapper.map_frame(self._images, index, vector, self.keyframes)
-        self._mapped = index
+        extent = measured_extent(depth, pose_from_vector(vector), self.intrinsics)
+        self._scheduler.start(MappingTask("first" if first else "frame", index, vector, extent), self.keyframes)
         self._seen.append(SeenDepth.of(index, depth))
+        return {**losses, **self._take_over(wait=first)}
+
+    def _take_over(self, *, wait: bool = False) -> dict[str, float]:
+        """What the mapper has finished since: the map, the poses it refined, and its losses, which are returned."""
+        finished = self._scheduler.finished(wait=wait)
+        if finished is None:
+            return {}
+        frame, result = finished
+        self._mapped = frame
         if result.adjusted:
-            self._write_back(index, result.vector)
+            self._write_back(frame, result.vector)
         return result.losses
 
     def _write_back(self, index: int, vector: np.ndarray) -> None:
@@ -259,6 +278,7 @@ class Slam:
         Raises:
             MeshError: nothing was seen, or there is no surface.
         """
+        self.wait()
         config = self.config.meshing
         camera = self.intrinsics.strided(SEEN_STRIDE)
         return extract_mesh(

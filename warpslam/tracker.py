@@ -97,7 +97,7 @@ class Tracker:
 
     def _descend(self, batch: RayBatch, arrays: FieldArrays, images: ImagePool) -> None:
         """The paper's optimiser: a step of Adam on the pose vector."""
-        with wp.Tape() as tape:
+        with self._launcher.tape() as tape:
             self._render(batch, arrays, images, tape)
             batch.tracking_loss(self.config.color_weight)
         self._launcher.call(partial(tape.backward, batch.loss))

@@ -106,7 +106,7 @@ class Iteration:
         """Mapping loss and the gradient of everything that the stage has one for."""
         self.poses.grad.zero_()
         gradients = self._wanted(MAPPED_LEVELS[self.stage], points=self.stage != "coarse")
-        with wp.Tape() as tape:
+        with self.batch.launcher.tape() as tape:
             self.cast_and_sample()
             self.render(gradients, tape)
             self.batch.mapping_loss(0.2 if self.stage == "color" else 0.0)
@@ -121,7 +121,7 @@ class Iteration:
     def tracking(self, *, filter_factor: float = 10.0, median_includes_missing: bool = True) -> Gradient:
         """Tracking loss and the gradient of the poses alone."""
         self.poses.grad.zero_()
-        with wp.Tape() as tape:
+        with self.batch.launcher.tape() as tape:
             self.cast_and_sample()
             self.render(Gradients(points=True), tape)
             self.batch.choose_inliers(filter_factor, median_includes_missing=median_includes_missing)

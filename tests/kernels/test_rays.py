@@ -99,7 +99,7 @@ def render(batch: RayBatch, scene_map: SceneMap, *thresholds: float):
     grid = GridGradient(gradient_buffers(rows, batch.device), wp.full(rows, 1, dtype=wp.uint8, device=batch.device))
     for array in (batch.origin.grad, batch.direction.grad):
         array.zero_()
-    with wp.Tape() as tape:
+    with batch.launcher.tape() as tape:
         gradients = Gradients({"color": grid}, points=True)
         batch.render(arrays, "color", gradients, tape, thresholds=Thresholds(*thresholds))
         batch.mapping_loss(0.2)

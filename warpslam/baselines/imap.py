@@ -151,7 +151,7 @@ class Imap(Baseline):
         batch.set_seeds([ray_seed(self.seed, _TRACKING, index, n) for n in range(iterations)])
 
         def iterate() -> None:
-            with wp.Tape() as tape:
+            with self._launcher.tape() as tape:
                 self._tracking_loss(Wanted(points=True), tape)
             self._launcher.call(partial(tape.backward, batch.loss))
             self._poses.update()
@@ -217,7 +217,7 @@ class Imap(Baseline):
         bound, wanted = self._bound, Wanted(weights=self._optimizer.gradient)
 
         def iterate(rate: float) -> None:
-            with wp.Tape() as tape:
+            with self._launcher.tape() as tape:
                 batch.draw(self._images.arrays, slots, pixels, self.intrinsics)
                 batch.cast(poses)
                 batch.bound_to(bound.low, bound.high)

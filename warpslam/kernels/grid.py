@@ -185,3 +185,10 @@ def fill_grid(
         features[row] = old_features[row_of(old_lattice, a, b, c)]
     else:
         features[row] = init_normal(seed, level, first[0] + i, first[1] + j, first[2] + k, std)
+
+
+@wp.kernel(enable_backward=False)
+def copy_rows(rows: wp.array(dtype=int), source: wp.array(dtype=Vec32), target: wp.array(dtype=Vec32)):
+    """Copy the rows that are listed from one grid to another of the same shape."""
+    row = rows[wp.tid()]
+    target[row] = source[row]
