@@ -84,12 +84,20 @@ class Mapper:
         """A later frame: window, frustum selection, three stages, bundle adjustment once there are enough keyframes."""
         return self._optimize(images, frame, vector, keyframes, self.config.iterations, 1.0)
 
-    def refine(self, images: ImagePool, frame: int, vector: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
+    def refine(
+        self,
+        images: ImagePool,
+        frame: int,
+        vector: np.ndarray,
+        keyframes: list[Keyframe],
+        first_round: int,
+        rounds: int,
+    ) -> MappingResult:
         """Final colour refinement: a doubled window, all vertices, colour stage only, colour decoder fixed, several
-        rounds.
+        rounds, whose numbers are part of the seeds.
         """
         result = MappingResult(vector)
-        for round_ in range(self.config.refinement_rounds):
+        for round_ in range(first_round, first_round + rounds):
             result = self._optimize(
                 images, frame, result.vector, keyframes, self.config.iterations, 1.0, refinement=True, round_=round_
             )
