@@ -22,6 +22,7 @@ _WRITTEN_FILES = (
     "log.txt",
     "map.npz",
     "mesh.ply",
+    "mesh_forecast.ply",
     "metrics.json",
     "panels.png",
     "timing.json",
@@ -47,8 +48,9 @@ class Source:
 class RunFolder:
     """Paths of one run.
 
-    ``config`` effective settings, ``trajectory`` and ``ground_truth`` in TUM format, ``mesh``, ``map`` for later
-    rendering, ``metrics``, ``timing``, ``source`` (how to open the input again), ``log``, and the plots.
+    ``config`` effective settings, ``trajectory`` and ``ground_truth`` in TUM format, ``mesh`` and ``forecast_mesh``,
+    ``map`` for later rendering, ``metrics``, ``timing``, ``source`` (how to open the input again), ``log``, and the
+    plots.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -57,6 +59,7 @@ class RunFolder:
         self.trajectory = self.path / "trajectory.tum"
         self.ground_truth = self.path / "ground_truth.tum"
         self.mesh = self.path / "mesh.ply"
+        self.forecast_mesh = self.path / "mesh_forecast.ply"
         self.map = self.path / "map.npz"
         self.metrics = self.path / "metrics.json"
         self.timing = self.path / "timing.json"

@@ -56,7 +56,7 @@ def test_forecast_is_the_biased_coarse_surface(both):
     p = p[(mesh.visual.vertex_colors[extra] == CYAN).all(axis=1)]
     on_wall = np.abs(ROOM - np.abs(p)).min(axis=1) < 0.005
     far_from_ball = np.linalg.norm(p, axis=1) > RADIUS + 0.15
-    assert far_from_ball.mean() > 0.5 and on_wall[far_from_ball].mean() > 0.97
+    assert far_from_ball.sum() > 200 and on_wall[far_from_ball].mean() > 0.97
 
 
 def test_forecast_stays_in_reach_and_in_the_hull(both):

@@ -16,6 +16,7 @@ from warpslam.cli.common import (
     duration,
     parse_frames,
     print_reconstruction,
+    print_rendering,
     quiet_warp,
     warnings_on_stderr,
 )
@@ -39,7 +40,9 @@ def add(commands: Any) -> None:
     run.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
     run.add_argument("--preset", help="settings to start from (default: the dataset's)")
     run.add_argument("--frames", type=parse_frames, metavar="A:B:STEP", help="frames to use, as in a Python slice")
-    run.add_argument("--truth-mesh", metavar="FILE", help="true surface, for the reconstruction metrics")
+    run.add_argument(
+        "--gt-mesh", "--truth-mesh", dest="truth_mesh", metavar="FILE", help="true surface, for reconstruction metrics"
+    )
     add_run_options(run)
 
     demo = add_command(commands, "demo", _demo, "SLAM in a small rendered room; needs no data")
@@ -48,7 +51,7 @@ def add(commands: Any) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     from warpslam.config import Config
-    from warpslam.pipeline import load_mesh
+    from warpslam.evaluation import load_mesh
     from warpslam.revisit import open_source
     from warpslam.run_folder import Source
 
@@ -155,5 +158,5 @@ def _print_summary(result: RunResult) -> None:
         print_reconstruction(metrics["reconstruction"])
     rendering = metrics.get("rendering")
     if rendering:
-        print(f"rendering   depth L1 {100 * rendering['depth_l1_m']:.2f} cm, PSNR {rendering['psnr_db']:.1f} dB")
+        print_rendering(rendering)
     print(f"written to  {result.folder.path}")
