@@ -19,8 +19,8 @@ def add(commands: Any) -> None:
     )
     evaluate.add_argument(
         "--protocol", metavar="NAME",
-        help="which surface counts in that: frustum (what lies in a frame's image), frustum+occlusion (and is not hidden "
-        "there; the default), frustum+occlusion+virtual (or is seen by virtual cameras), or all, one after the other",
+        help="which surface counts in that: frustum (what lies in a frame's image), frustum+occlusion (and is not "
+        "hidden there; the default), frustum+occlusion+virtual (or is seen by virtual cameras), or all of them",
     )  # fmt: skip
     evaluate.add_argument(
         "--views", type=int, default=0, metavar="N", help="render N frames in full for PSNR, SSIM and depth L1 (0)"

@@ -29,6 +29,8 @@ DEFAULT_PROTOCOL = "frustum+occlusion"
 SAMPLE_COUNT = 200_000
 OCCLUSION_TOLERANCE = 0.05  # [m]
 _SAMPLING_ROUNDS = 40
+_LARGE_TRIANGLE = 0.25  # [m] from its middle to a corner
+_MOST_TRIANGLES = 500_000
 
 
 @dataclass(frozen=True)
@@ -148,20 +150,16 @@ def sample_surface(
     corners = vertices[faces] if len(faces) else np.zeros((0, 3, 3))
     if not np.isfinite(corners).all():
         raise MeshError("the mesh has a vertex that is NaN or infinite, so its surface can't be sampled")
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    doubled = np.linalg.norm(normals, axis=1)
-    if doubled.sum() <= 0:
+    if not _vectors(corners).any():
         raise MeshError(f"the mesh ({len(vertices)} vertices, {len(faces)} faces) has no surface to sample")
     rng = np.random.default_rng(seed)
     if culling is None:
-        return _draw(rng, corners, normals, doubled, count)
-    middle = corners.mean(axis=1)
-    near = culling.may_keep(middle, np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1))
-    corners, normals, doubled = corners[near], normals[near], doubled[near]
+        return _draw(rng, corners, count)
+    corners = _near_triangles(corners, culling)
     parts: list[tuple[np.ndarray, np.ndarray]] = []
     missing = count
-    for _ in range(_SAMPLING_ROUNDS if doubled.sum() > 0 else 0):
-        points, of_points = _draw(rng, corners, normals, doubled, count)
+    for _ in range(_SAMPLING_ROUNDS if _vectors(corners).any() else 0):
+        points, of_points = _draw(rng, corners, count)
         kept = culling.keeps(points)
         parts.append((points[kept][:missing], of_points[kept][:missing]))
         missing -= len(parts[-1][0])
@@ -176,17 +174,37 @@ def sample_surface(
     return np.concatenate(found), np.concatenate(normals_found)
 
 
-def _draw(
-    rng: np.random.Generator, corners: np.ndarray, normals: np.ndarray, weights: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Points and unit normals (count, 3) on triangles (F, 3, 3), drawn in proportion to the weights (F,)."""
-    face = rng.choice(len(weights), size=count, p=weights / weights.sum())
+def _near_triangles(corners: np.ndarray, culling: Culling) -> np.ndarray:
+    """The triangles (F, 3, 3) that may hold a point that counts; large ones are split, so that little else is left."""
+    while True:
+        middle = corners.mean(axis=1)
+        radii = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1, initial=0.0)
+        near = culling.may_keep(middle, radii)
+        corners, large = corners[near], radii[near] > _LARGE_TRIANGLE
+        if not large.any() or len(corners) > _MOST_TRIANGLES:
+            return corners
+        a, b, c = corners[large].transpose(1, 0, 2)
+        ab, bc, ca = 0.5 * (a + b), 0.5 * (b + c), 0.5 * (c + a)
+        quarters = [np.stack(quarter, axis=1) for quarter in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        corners = np.concatenate([corners[~large], *quarters])
+
+
+def _vectors(corners: np.ndarray) -> np.ndarray:
+    """Normals of triangles (F, 3, 3), as long as twice their area, (F, 3)."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
+def _draw(rng: np.random.Generator, corners: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points on triangles (F, 3, 3), uniform over their area, and the unit normals there, (count, 3) each."""
+    normals = _vectors(corners)
+    doubled = np.linalg.norm(normals, axis=1)
+    face = rng.choice(len(doubled), size=count, p=doubled / doubled.sum())
     # Folding the unit square's upper half onto the lower one draws uniformly over the triangle.
     u, v = rng.random((2, count, 1))
     folded = u + v > 1
     u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
     a, b, c = corners[face].transpose(1, 0, 2)
-    return a + u * (b - a) + v * (c - a), normals[face] / weights[face, None]
+    return a + u * (b - a) + v * (c - a), normals[face] / doubled[face, None]
 
 
 def _ball_in_frustum(
