@@ -144,12 +144,29 @@ def test_missing_depth_is_no_evidence(device):
     assert extract_mesh(BallRoom(), [whole], device=device).vertices[:, 0].min() < -0.5
 
 
-def test_small_components_are_dropped(everything, device):
-    """The ball (1.13 m^2) goes when pieces below 2 m^2 are dropped."""
-    mesh = extract_mesh(BallRoom(), everything, voxel=0.04, min_component_area=2.0, device=device)
-    assert np.linalg.norm(mesh.vertices - OFFSET, axis=1).min() > 0.7
+class Floater(BallRoom):
+    """A second ball of 10 cm in free space, which no camera measured: they look through it."""
+
+    def query_occupancy(self, points, level="fine"):
+        d = np.linalg.norm(points - np.array([0.7, 0.5, 0.3]) - OFFSET, axis=1) - 0.1
+        return np.maximum(super().query_occupancy(points, level), -10 * d).astype(np.float32)
+
+
+def test_small_components_are_dropped_unless_measured(everything, device):
+    """Of two balls, both below the least area, the one that the depth images show stays and the floating one goes."""
+    settings = {"voxel": 0.04, "band": None, "device": device}
+    mesh = extract_mesh(Floater(), everything, min_component_area=2.0, **settings)
+    floating = np.linalg.norm(mesh.vertices - OFFSET - [0.7, 0.5, 0.3], axis=1) < 0.15
+    on_ball = np.linalg.norm(mesh.vertices - OFFSET, axis=1) < 0.35
+    assert on_ball.sum() > 500 and not floating.any()
+    kept = extract_mesh(Floater(), everything, min_component_area=0.05, **settings)
+    assert (np.linalg.norm(kept.vertices - OFFSET - [0.7, 0.5, 0.3], axis=1) < 0.15).sum() > 50
+
+
+def test_small_and_unmeasured_is_an_error(everything, device):
+    """A surface 8 cm in front of everything that was measured, all of whose pieces are too small."""
     with pytest.raises(MeshError, match="min_component_area"):
-        extract_mesh(BallRoom(), everything, voxel=0.04, min_component_area=500.0, device=device)
+        extract_mesh(BallRoom(), everything, voxel=0.04, level_set=-0.8, min_component_area=500.0, device=device)
 
 
 def test_level_set_moves_the_surface(everything, device):

@@ -14,13 +14,16 @@ def keep_faces(vertices: np.ndarray, faces: np.ndarray, keep: np.ndarray) -> tup
     return vertices[used], index.reshape(-1, 3)
 
 
-def piece_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area [m^2] of the connected piece that each face belongs to, (F,)."""
+def piece_areas(
+    vertices: np.ndarray, faces: np.ndarray, marked: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Area [m^2] of the connected piece that each face belongs to, and how much of it is `marked` (F,); (F,) each."""
     rows, columns = faces.ravel(), np.roll(faces, 1, axis=1).ravel()
     graph = coo_matrix((np.ones(len(rows), dtype=np.uint8), (rows, columns)), shape=(len(vertices),) * 2)
     label = connected_components(graph, directed=False)[1][faces[:, 0]]
-    doubled = np.linalg.norm(face_vectors(vertices, faces), axis=1)
-    return np.bincount(label, weights=0.5 * doubled)[label]
+    area = 0.5 * np.linalg.norm(face_vectors(vertices, faces), axis=1)
+    marked_area = np.zeros(len(faces)) if marked is None else area * marked
+    return np.bincount(label, weights=area)[label], np.bincount(label, weights=marked_area)[label]
 
 
 def face_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

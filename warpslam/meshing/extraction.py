@@ -38,6 +38,9 @@ _HULL_SCALE = 1.02
 # forecast's first surface behind a seen one lies at least as deep as the second. Both in multiples of behind_surface.
 _FACING_MARGIN = 0.5
 _SHADOW_MARGIN = 2.0
+# A small piece stays where a view measured a surface this close [m] to at least this share of its area.
+_MEASURED_DISTANCE = 0.04
+_MEASURED_SHARE = 0.5
 
 _SEEN, _FORECAST = 0, 1
 _BLOCK_CELLS = 64
@@ -79,7 +82,8 @@ def extract_mesh(
     views: Depth images that say what was seen, usually the keyframes; a fraction of the resolution is enough.
     voxel: Lattice spacing [m].
     level_set: Logit of the surface; above is occupied.
-    min_component_area: Connected pieces with less area [m^2] are dropped.
+    min_component_area: Connected pieces with less area [m^2] are dropped, unless views measured a surface within 4 cm
+        of half of it: what is seen through a lattice comes in small pieces, but so do floating artefacts.
     behind_surface: Points up to this far behind a measured surface [m] count as observed; at least two voxels are used.
     band: The field is asked only at points this close to a measured surface [m] (at least two voxels); other observed
         points are taken as free. None asks it at every observed point, which also shows floating artefacts.
@@ -122,18 +126,12 @@ def extract_mesh(
         )
     if cull_back_faces:
         seen = _front_faces(vertices, seen, evidence)
-    areas = piece_areas(vertices, seen)
-    if areas.max() < min_component_area:
-        raise MeshError(
-            f"no surface is left: the largest connected piece has {areas.max():.3g} m^2, less than min_component_area "
-            f"= {min_component_area} m^2; map more frames or lower min_component_area"
-        )
-    seen = seen[areas >= min_component_area]
+    seen = seen[_is_surface(vertices, seen, evidence, min_component_area, voxel)]
     extra = faces[group == _FORECAST]
     if hull is not None and len(extra):
         extra = extra[hull.contains(vertices)[extra].any(axis=1) & ~_in_shadow(vertices, extra, evidence)]
-        areas = piece_areas(vertices, np.concatenate([seen, extra]))[len(seen) :]
-        extra = extra[areas >= min_component_area]
+        areas, _ = piece_areas(vertices, np.concatenate([seen, extra]))
+        extra = extra[areas[len(seen) :] >= min_component_area]
     return _finished(scene, vertices, seen, extra)
 
 
@@ -206,6 +204,23 @@ def _front_faces(vertices: np.ndarray, faces: np.ndarray, evidence: Evidence) ->
             "check the poses and the depth scale, or pass cull_back_faces=False to look at the faces"
         )
     return faces[facing]
+
+
+def _is_surface(
+    vertices: np.ndarray, faces: np.ndarray, evidence: Evidence, min_area: float, voxel: float
+) -> np.ndarray:
+    """Faces of pieces that are large or measured, bool (F,); raises `MeshError` if there is none."""
+    centers, normals = vertices[faces].mean(axis=1), face_vectors(vertices, faces)
+    distance = max(_MEASURED_DISTANCE, voxel)
+    area, measured = piece_areas(vertices, faces, evidence.facing(centers, normals, -distance, distance))
+    kept = (area >= min_area) | (measured >= _MEASURED_SHARE * area)
+    if not kept.any():
+        raise MeshError(
+            f"no surface is left: the largest connected piece has {area.max():.3g} m^2, less than min_component_area "
+            f"= {min_area} m^2, and no view measured a surface where the pieces are; map more frames or lower "
+            "min_component_area"
+        )
+    return kept
 
 
 def _in_shadow(vertices: np.ndarray, faces: np.ndarray, evidence: Evidence) -> np.ndarray:
