@@ -117,10 +117,14 @@ class FakeSlam:
         shape = (-(-CAMERA.height // stride), -(-CAMERA.width // stride))
         return FakeImage(np.full(shape, 2.03, np.float32), np.full((*shape, 3), 0.2, np.float32), np.zeros(shape))
 
-    def mesh(self, voxel: float = 0.02) -> trimesh.Trimesh:
+    def refine(self, rounds: int) -> None:
+        self.refined = rounds
+
+    def mesh(self, voxel: float = 0.02, *, forecast: bool = False) -> trimesh.Trimesh:
         if self.mesh_fails:
             raise MeshError("the map has no surface")
         mesh = wall()
+        mesh.metadata["forecast_faces"] = 1 if forecast else 0
         mesh.visual.vertex_colors = np.tile(np.uint8([10, 20, 30, 255]), (len(mesh.vertices), 1))
         return mesh
 

@@ -15,7 +15,7 @@ from tests.fakes import FakeSequence, FakeSlam, true_pose, wall
 from warpslam import pipeline, revisit
 from warpslam.config import Config
 from warpslam.errors import ConfigError, DatasetError, InputError, MeshError
-from warpslam.evaluation import read_tum
+from warpslam.evaluation import load_mesh, read_tum
 from warpslam.plots import load_panels, top_view_axes
 from warpslam.run_folder import RunFolder, Source, read_json, to_json
 
@@ -295,7 +295,7 @@ def test_missing_pieces_of_a_run_are_named(tmp_path):
     with pytest.raises(DatasetError, match="no map.safetensors"):
         folder.require(folder.map, "the run stopped before it had a map")
     with pytest.raises(MeshError, match="metrics.json"):
-        pipeline.load_mesh(folder.metrics)
+        load_mesh(folder.metrics)
 
 
 def test_given_poses_replace_those_of_the_sequence(fake_slam, tmp_path):

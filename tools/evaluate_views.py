@@ -13,7 +13,7 @@ import numpy as np
 
 from warpslam.cli.common import parse_frames
 from warpslam.errors import WarpSlamError
-from warpslam.pipeline import psnr
+from warpslam.evaluation import psnr
 from warpslam.sequences import Frame, open_sequence
 from warpslam.slam import Slam
 

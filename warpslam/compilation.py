@@ -52,7 +52,7 @@ Report = Callable[[ModuleProgress], None]
 
 def module_names(target: str) -> list[str]:
     """Warp modules of a run on ``target`` "cpu" or "cuda", those that take longest to compile first."""
-    return [f"warpslam.decoder_{target}", *(f"warpslam.kernels.{stage}" for stage in _STAGES), "warpslam.meshing"]
+    return [f"warpslam.decoder_{target}", *(f"warpslam.kernels.{stage}" for stage in _STAGES), "warpslam.meshing.views"]
 
 
 def compile_kernels(device: wp.Device, report: Report | None = None, extra: Sequence[str] = ()) -> list[ModuleProgress]:

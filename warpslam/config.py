@@ -172,7 +172,9 @@ class MeshingConfig(_Group):
     level_set: float = Field(
         -0.1, description="logit of the surface; 0 (occupancy 1/2, the paper) loses what was mapped for a short time"
     )
-    min_component_area: float = Field(0.2, ge=0, description="smaller loose pieces are dropped [m^2]")
+    min_component_area: float = Field(
+        0.2, ge=0, description="smaller loose pieces are dropped [m^2], unless measured depth confirms them"
+    )
 
 
 class TsdfConfig(_Group):

@@ -102,12 +102,19 @@ class Mapper:
         """`map_frame` without waiting for the device: the function that is returned waits, and reads the outcome."""
         return self._optimize(images, frame, vector, keyframes, self.config.iterations, 1.0)
 
-    def refine(self, images: ImagePool, frame: int, vector: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
+    def refine(
+        self,
+        images: ImagePool,
+        frame: int,
+        vector: np.ndarray,
+        keyframes: list[Keyframe],
+        rounds: range,
+    ) -> MappingResult:
         """Final colour refinement: a doubled window, all vertices, colour stage only, colour decoder fixed, several
-        rounds.
+        rounds, whose numbers are part of the seeds.
         """
         result = MappingResult(vector)
-        for round_ in range(self.config.refinement_rounds):
+        for round_ in rounds:
             result = self._optimize(
                 images, frame, result.vector, keyframes, self.config.iterations, 1.0, refinement=True, round_=round_
             )()

@@ -22,16 +22,16 @@ import numpy as np
 
 from warpslam.errors import ConfigError, DatasetError, InputError, MeshError, WarpSlamError
 from warpslam.evaluation import (
+    DEFAULT_PROTOCOL,
     AteResult,
     ReconstructionResult,
-    Statistics,
     associate,
     ate,
-    cull_mesh,
-    depth_l1,
-    evaluate_reconstruction,
+    evaluate_mesh,
     read_tum,
-    rpe,
+    reconstruction_metrics,
+    rendering_metrics,
+    trajectory_metrics,
     write_tum,
 )
 from warpslam.method import DEFAULT_METHOD, build_method, load_method
@@ -61,8 +61,6 @@ log = logging.getLogger(__name__)
 
 PANEL_COUNT = 4
 PANEL_WIDTH = 240  # [px], at most
-CULLING_VIEW_COUNT = 60
-MAX_EDGE = 0.05  # [m], larger faces are split before the unseen part of a mesh is cut off
 
 
 @dataclass(frozen=True)
@@ -438,12 +436,12 @@ class _Run:
 
     def _write_mesh(self) -> None:
         assert self.slam is not None
-        from warpslam.meshing import write_ply
+        from warpslam.meshing import write_mesh
 
         try:
             with self._clock("meshing"):
                 mesh = self.slam.mesh()
-                write_ply(mesh, self.folder.mesh)
+                write_mesh(mesh, self.folder.mesh)
         except MeshError as error:
             log.error("no mesh: %s", error)
             self.metrics["mesh"] = {"error": str(error)}
@@ -459,13 +457,15 @@ class _Run:
         poses = np.where(known[:, None, None], truth, trajectory.poses[:count])
         try:
             with self._clock("evaluation"):
-                self.reconstruction = evaluate_mesh(
-                    self.folder.mesh, self.truth_mesh, self.sequence, self.frame_indices[:count], poses, seed=self.seed
+                indices = self.frame_indices[:count]
+                results = evaluate_mesh(
+                    self.folder.mesh, self.truth_mesh, self.sequence, indices, poses, device=self.device
                 )
         except MeshError as error:
             log.error("no reconstruction metrics: %s", error)
             self.metrics["reconstruction"] = {"error": str(error)}
             return
+        self.reconstruction = results[DEFAULT_PROTOCOL]
         self.metrics["reconstruction"] = reconstruction_metrics(self.reconstruction)
 
     def _draw_plots(self) -> None:
@@ -484,11 +484,7 @@ class _Run:
         with self._clock("plotting"):
             plot_panels(self.folder.panels, panels)
             save_panels(self.folder.panel_images, panels)
-        self.metrics["rendering"] = {
-            "frames": [panel.index for panel in panels],
-            "depth_l1_m": float(np.mean([depth_l1(panel.rendered_depth, panel.depth) for panel in panels])),
-            "psnr_db": float(np.mean([psnr(panel.rendered_rgb, panel.rgb) for panel in panels])),
-        }
+        self.metrics["rendering"] = rendering_metrics(panels)
 
     def _losses(self, count: int) -> dict[str, np.ndarray]:
         names = sorted({name for result in self.results for name in result.losses})
@@ -736,99 +732,6 @@ def render_panel(slam: Method, frame: Frame, T_world_camera: np.ndarray, stride:
     image = slam.render(T_world_camera, stride=stride)
     rgb, depth = frame.rgb[::stride, ::stride], frame.depth[::stride, ::stride]
     return Panel(frame.index, rgb, depth, np.asarray(image.rgb), np.asarray(image.depth))
-
-
-def evaluate_mesh(
-    mesh_path: Path,
-    truth_mesh: trimesh.Trimesh,
-    sequence: RgbdSequence,
-    frame_indices: list[int],
-    poses: np.ndarray,
-    *,
-    seed: int = 0,
-) -> ReconstructionResult:
-    """Reconstruction metrics of a mesh over the part of the true surface that the sequence shows.
-
-    Completion is taken over what some frame saw, occlusion included. Accuracy is taken against all of the true surface,
-    over what lies in some frame's image, so that surface invented behind a wall counts against the reconstruction.
-
-    Args:
-        mesh_path: Mesh to judge.
-        truth_mesh: True surface [m], same world frame.
-        sequence: Where the depth images for the occlusion test come from.
-        frame_indices: Frames that were used, N of them.
-        poses: Their camera-to-world transforms, shape (N, 4, 4).
-        seed: Seed of the drawn points.
-
-    Raises:
-        MeshError: A mesh can't be read or has no surface in view.
-    """
-    chosen = np.unique(np.linspace(0, len(frame_indices) - 1, CULLING_VIEW_COUNT).round().astype(int))
-    views, depths = poses[chosen], [sequence[frame_indices[position]].depth for position in chosen]
-    seen_truth = cull_mesh(truth_mesh, views, sequence.intrinsics, depths, max_edge=MAX_EDGE)
-    mesh = cull_mesh(load_mesh(mesh_path), views, sequence.intrinsics, max_edge=MAX_EDGE)
-    return evaluate_reconstruction(mesh, truth_mesh, seen_truth=seen_truth, seed=seed)
-
-
-def load_mesh(path: str | Path) -> trimesh.Trimesh:
-    """Read a triangle mesh.
-
-    Raises:
-        MeshError: The file can't be read or holds no triangles.
-    """
-    import trimesh
-
-    try:
-        mesh = trimesh.load(str(path), force="mesh", process=False)
-    except Exception as error:  # trimesh lets its parsers' own exceptions through
-        raise MeshError(f"{path}: can't be read as a mesh ({error})") from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise MeshError(f"{path}: holds no triangles")
-    return mesh
-
-
-def trajectory_metrics(poses: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
-    """ATE with and without alignment, and RPE from frame to frame, of poses (N, 4, 4) against truth (N, 4, 4)."""
-    aligned = ate(poses, truth)
-    metrics: dict[str, Any] = {
-        "ate_m": {
-            "aligned": _statistics(aligned),
-            "unaligned": _statistics(ate(poses, truth, align=False)),
-            "frames_without_truth": aligned.skipped_count,
-        }
-    }
-    try:
-        relative = rpe(poses, truth)
-    except InputError as error:  # no two neighbours with known truth
-        log.info("no relative error: %s", error)
-    else:
-        metrics["rpe"] = {
-            "delta_frames": relative.delta,
-            "translation_m": _statistics(relative.translation),
-            "rotation_deg": _statistics(relative.rotation),
-        }
-    return metrics
-
-
-def _statistics(error: Statistics) -> dict[str, float]:
-    return {name: getattr(error, name) for name in ("rmse", "mean", "median", "std", "min", "max")}
-
-
-def reconstruction_metrics(result: ReconstructionResult) -> dict[str, Any]:
-    """The figures of a reconstruction, named with their units."""
-    return {
-        "accuracy_m": result.accuracy,
-        "completion_m": result.completion,
-        "completion_ratio_5cm": result.completion_ratio,
-        "samples": result.sample_count,
-        "T_truth_mesh": result.T_truth_mesh,
-    }
-
-
-def psnr(rendered: np.ndarray, rgb: np.ndarray) -> float:
-    """Peak signal-to-noise ratio [dB] of a rendering (H, W, 3), 0..1, against a uint8 image (H, W, 3)."""
-    mean_square = float(np.mean((np.clip(rendered, 0, 1) - rgb / 255.0) ** 2))
-    return float(-10 * np.log10(max(mean_square, 1e-12)))
 
 
 def select_frames(sequence: RgbdSequence, frames: slice | None) -> range:

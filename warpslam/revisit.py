@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from warpslam.errors import DatasetError, InputError
-from warpslam.evaluation import associate, read_tum
-from warpslam.pipeline import (
+from warpslam.evaluation import (
+    DEFAULT_PROTOCOL,
+    associate,
     evaluate_mesh,
     load_mesh,
-    load_slam,
+    read_tum,
     reconstruction_metrics,
-    render_panel,
+    rendering_metrics,
     trajectory_metrics,
 )
+from warpslam.pipeline import load_slam, render_panel
 from warpslam.run_folder import RunFolder, Source, read_json
 
 if TYPE_CHECKING:
@@ -44,6 +49,9 @@ def evaluate_run(
     *,
     max_difference: float = 0.02,
     truth_mesh: str | Path | None = None,
+    protocols: Sequence[str] = (DEFAULT_PROTOCOL,),
+    rendered_views: int = 0,
+    device: str | None = None,
 ) -> dict[str, Any]:
     """Errors of a run, under the names of metrics.json.
 
@@ -52,8 +60,14 @@ def evaluate_run(
         truth: Trajectory in the TUM format; None for the ground truth that came with the sequence.
         max_difference: Largest difference in time of an estimated and a true pose [s].
         truth_mesh: True surface to compare the mesh with.
+        protocols: Culling protocols of that comparison, of `warpslam.evaluation.PROTOCOLS`. The figures of the first
+            are "reconstruction"; those of all are "reconstruction_by_protocol" if there are several.
+        rendered_views: Frames, evenly spread, that are rendered from the map at their estimated poses, in full, and
+            compared with what the camera saw; slow without a GPU.
+        device: Warp device.
 
     Raises:
+        ConfigError: There is no such protocol or device.
         DatasetError: A file is missing or damaged, or no pose has a partner.
         MeshError: A mesh can't be read or has nothing in view.
     """
@@ -70,12 +84,27 @@ def evaluate_run(
     metrics: dict[str, Any] = {"frames": {"estimated": len(times), "compared": int(paired.sum())}}
     metrics.update(trajectory_metrics(poses[paired], truth_poses[partner[paired]]))
     if truth_mesh is not None:
+        # What counts is decided at true poses, as in the run: a wrong trajectory must not choose what it is judged by.
+        known = np.where(paired[:, None, None], truth_poses[partner], poses)
         mesh = folder.require(folder.mesh, "see metrics.json for why the run made none")
-        sequence = open_source(folder.read_source())
-        indices = _frame_indices(folder, len(times))
-        result = evaluate_mesh(mesh, load_mesh(truth_mesh), sequence, indices, poses)
-        metrics["reconstruction"] = reconstruction_metrics(result)
+        sequence, indices = open_source(folder.read_source()), _frame_indices(folder, len(times))
+        results = evaluate_mesh(
+            mesh, load_mesh(truth_mesh), sequence, indices, known, protocols=protocols, device=device
+        )
+        by_protocol = {name: reconstruction_metrics(result) for name, result in results.items()}
+        metrics["reconstruction"] = by_protocol[protocols[0]]
+        if len(by_protocol) > 1:
+            metrics["reconstruction_by_protocol"] = by_protocol
+    if rendered_views > 0:
+        metrics["rendering"] = _rendering_metrics(folder, poses, rendered_views, device)
     return metrics
+
+
+def _rendering_metrics(folder: RunFolder, poses: np.ndarray, count: int, device: str | None) -> dict[str, Any]:
+    slam, sequence = load_slam(folder, device), open_source(folder.read_source())
+    indices = _frame_indices(folder, len(poses))
+    chosen = np.unique(np.linspace(0, len(poses) - 1, count).round().astype(int))
+    return rendering_metrics([render_panel(slam, sequence[indices[n]], poses[n]) for n in chosen])
 
 
 def render_frame(folder: RunFolder, index: int, output: str | Path | None = None, device: str | None = None) -> Path:
@@ -106,25 +135,38 @@ def render_frame(folder: RunFolder, index: int, output: str | Path | None = None
 
 
 def extract_mesh(
-    folder: RunFolder, voxel: float | None = None, output: str | Path | None = None, device: str | None = None
+    folder: RunFolder,
+    voxel: float | None = None,
+    output: str | Path | None = None,
+    device: str | None = None,
+    *,
+    forecast: bool = False,
+    refinement_rounds: int = 0,
 ) -> tuple[trimesh.Trimesh, Path]:
-    """Extract the mesh of the final map and write it as PLY.
+    """Extract the mesh of the final map and write it. The map itself stays as the run left it.
 
     Args:
         folder: Run.
         voxel: Edge of a marching-cubes cell [m]; None for the setting of the run.
-        output: File to write; None for mesh.ply in the run folder.
+        output: File to write, .ply or .glb; None for mesh.ply in the run folder, mesh_forecast.ply with a forecast.
         device: Warp device.
+        forecast: Add what the coarse level suggests where nothing was seen, in cyan.
+        refinement_rounds: Rounds of the global refinement before that.
 
     Raises:
         DatasetError: The run saved no map.
+        InputError: The map can't be refined.
         MeshError: There is no surface, or the file can't be written.
     """
-    from warpslam.meshing import write_ply
+    from warpslam.meshing import check_mesh_path, write_mesh
 
+    path = check_mesh_path(output if output is not None else folder.forecast_mesh if forecast else folder.mesh)
     slam = load_slam(folder, device)
-    mesh = slam.mesh() if voxel is None else slam.mesh(voxel=voxel)
-    return mesh, write_ply(mesh, output if output is not None else folder.mesh)
+    if refinement_rounds > 0:
+        slam.refine(refinement_rounds)
+    settings: dict[str, Any] = {} if voxel is None else {"voxel": voxel}
+    mesh = slam.mesh(**settings, forecast=True) if forecast else slam.mesh(**settings)
+    return mesh, write_mesh(mesh, path)
 
 
 def _frame_indices(folder: RunFolder, count: int) -> list[int]:

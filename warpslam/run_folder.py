@@ -27,6 +27,7 @@ _WRITTEN_FILES = (
     "log.txt",
     "map.safetensors",
     "mesh.ply",
+    "mesh_forecast.ply",
     "metrics.json",
     "panels.npz",
     "panels.png",
@@ -59,9 +60,10 @@ class RunFolder:
     """Paths of one run.
 
     ``config`` effective settings, ``trajectory`` and ``ground_truth`` in TUM format, ``frames`` (status of each) and
-    ``frame_records`` (the same with losses, for the report), ``mesh``, ``map`` for later rendering, ``metrics``,
-    ``timing``, ``source`` (how to open the input again), ``log``, ``report``, the plots, and the images of the panels
-    as arrays. While a run is under way, ``checkpoint`` and ``previous_checkpoint`` (see `warpslam.resume`).
+    ``frame_records`` (the same with losses, for the report), ``mesh`` and ``forecast_mesh``, ``map`` for later
+    rendering, ``metrics``, ``timing``, ``source`` (how to open the input again), ``log``, ``report``, the plots, and
+    the images of the panels as arrays. While a run is under way, ``checkpoint`` and ``previous_checkpoint`` (see
+    `warpslam.resume`).
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -70,6 +72,7 @@ class RunFolder:
         self.trajectory = self.path / "trajectory.tum"
         self.ground_truth = self.path / "ground_truth.tum"
         self.mesh = self.path / "mesh.ply"
+        self.forecast_mesh = self.path / "mesh_forecast.ply"
         self.map = self.path / "map.safetensors"
         self.checkpoint = self.path / "checkpoint.safetensors"
         self.previous_checkpoint = self.path / "checkpoint.previous.safetensors"

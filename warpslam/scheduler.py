@@ -40,12 +40,14 @@ class MappingTask:
     kind: "first" frame of a map, a later "frame", or final "refinement" of the map.
     frame: Its number. vector: Its pose vector (7,).
     extent: Box to grow the map to, lower and upper corner [m]; None leaves the map's.
+    rounds: Numbers of the rounds of a refinement.
     """
 
     kind: Literal["first", "frame", "refinement"]
     frame: int
     vector: np.ndarray
     extent: tuple[np.ndarray, np.ndarray] | None = None
+    rounds: range = range(0)
 
     def start(self, mapper: Mapper, images: ImagePool, keyframes: list[Keyframe]) -> Callable[[], MappingResult]:
         """Launch the work; the function that is returned waits for it and reads its outcome."""
@@ -56,7 +58,7 @@ class MappingTask:
         if self.kind == "frame":
             return mapper.start_frame(images, self.frame, self.vector, keyframes)
         # Its rounds build on one another: it is done when they are.
-        result = mapper.refine(images, self.frame, self.vector, keyframes)
+        result = mapper.refine(images, self.frame, self.vector, keyframes, self.rounds)
         return lambda: result
 
 

@@ -199,9 +199,30 @@ class Slam:
                 self.wait()
         if self.config.mapping.color_refinement and self.keyframes:
             with _timed(timings, "refinement", self.device):
-                self._scheduler.start(MappingTask("refinement", index, self._vectors[index]), self.keyframes)
-                self.wait()
+                self._refine(index, 0, self.config.mapping.refinement_rounds)
         return timings
+
+    def refine(self, rounds: int | None = None) -> None:
+        """More rounds of the global refinement that `finish` ends with (Sec. 3.1), on a map that is done.
+
+        Args:
+            rounds: `MappingConfig.refinement_rounds` by default. Their random draws are not those of `finish`.
+
+        Raises:
+            InputError: there is no keyframe, or the last frame was not OK, so there is no window to refine.
+        """
+        self.wait()
+        config, index = self.config.mapping, self._current
+        if index is None or self._status[index] != "OK" or not self.keyframes:
+            raise InputError("the map can't be refined: it has no keyframe, or its last frame was not OK")
+        done = config.refinement_rounds if config.color_refinement else 0
+        self._refine(index, done, config.refinement_rounds if rounds is None else rounds)
+
+    def _refine(self, index: int, first_round: int, rounds: int) -> None:
+        which = range(first_round, first_round + rounds)
+        task = MappingTask("refinement", index, self._vectors[index], rounds=which)
+        self._scheduler.start(task, self.keyframes)
+        self.wait()
 
     def wait(self) -> None:
         """Until every frame that was to be mapped is in the map (at once, unless `Config.schedule` is overlapped)."""
@@ -269,11 +290,12 @@ class Slam:
         arrays = self.scene.arrays()
         return render_image(arrays, self.intrinsics, T, self.config.sampling, self.device, depth=depth, stride=stride)
 
-    def mesh(self, voxel: float | None = None) -> trimesh.Trimesh:
+    def mesh(self, voxel: float | None = None, *, forecast: bool = False) -> trimesh.Trimesh:
         """Coloured mesh of what the mapped frames saw (A.4), in the world frame.
 
         Args:
             voxel: Edge of a marching-cubes cell [m]; `MeshingConfig.voxel` by default.
+            forecast: Add what the coarse level suggests where nothing was seen, in cyan.
 
         Raises:
             MeshError: nothing was seen, or there is no surface.
@@ -287,6 +309,8 @@ class Slam:
             voxel=voxel or config.voxel,
             level_set=config.level_set,
             min_component_area=config.min_component_area,
+            forecast=forecast,
+            device=str(self.device),
         )
 
     @property

@@ -75,13 +75,35 @@ def warnings_on_stderr() -> Iterator[None]:
         logger.removeHandler(handler)
 
 
-def print_reconstruction(figures: dict[str, Any]) -> None:
-    """Print reconstruction metrics, as `warpslam.pipeline.reconstruction_metrics` gives them."""
+def print_reconstruction(*protocols: dict[str, Any]) -> None:
+    """Print a table of reconstruction metrics, a line for each protocol, from what `reconstruction_metrics` gives."""
+    columns = ("accuracy", "completion", "< 5 cm", "F-score", "normals", "depth L1", "missed")
+    print(f"{'surface':26}" + "".join(f"{name:>12}" for name in columns))
+    for figures in protocols:
+        views = figures.get("virtual_views", {})
+        cells = [
+            _scaled(figures["accuracy_m"], 100, "cm"),
+            _scaled(figures["completion_m"], 100, "cm"),
+            _scaled(figures["completion_ratio_5cm"], 100, "%"),
+            _scaled(figures["f_score_5cm"], 100, "%"),
+            _scaled(figures["normal_consistency"], 1, ""),
+            _scaled(figures.get("depth_l1_m"), 100, "cm"),
+            _scaled(views.get("missed_share"), 100, "%"),
+        ]
+        print(f"{figures['protocol']:26}" + "".join(f"{cell:>12}" for cell in cells))
+
+
+def print_rendering(figures: dict[str, Any]) -> None:
+    """Print what `rendering_metrics` gives."""
+    ssim = _scaled(figures["ssim"], 1, "")
     print(
-        f"surface     accuracy {100 * figures['accuracy_m']:.2f} cm, "
-        f"completion {100 * figures['completion_m']:.2f} cm, "
-        f"{100 * figures['completion_ratio_5cm']:.1f} % within 5 cm"
+        f"rendering   depth L1 {100 * figures['depth_l1_m']:.2f} cm, PSNR {figures['psnr_db']:.1f} dB, SSIM {ssim}, "
+        f"{len(figures['frames'])} frames"
     )
+
+
+def _scaled(value: float | None, scale: float, unit: str) -> str:
+    return "-" if value is None or value != value else f"{scale * value:.2f} {unit}".rstrip()
 
 
 def quiet_warp() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from warpslam.cli.common import add_command, print_reconstruction
+from warpslam.cli.common import add_command, print_reconstruction, print_rendering, quiet_warp
 
 
 def add(commands: Any) -> None:
@@ -14,19 +14,39 @@ def add(commands: Any) -> None:
     evaluate.add_argument("run", metavar="RUN", help="run folder")
     evaluate.add_argument("--truth", metavar="FILE", help="TUM trajectory to compare with (default: the run's own)")
     evaluate.add_argument("--max-difference", type=float, default=0.02, metavar="S", help="for pairing [s] (0.02)")
-    evaluate.add_argument("--truth-mesh", metavar="FILE", help="true surface to compare the mesh with")
+    evaluate.add_argument(
+        "--gt-mesh", "--truth-mesh", dest="truth_mesh", metavar="FILE", help="true surface to compare the mesh with"
+    )
+    evaluate.add_argument(
+        "--protocol", metavar="NAME",
+        help="which surface counts in that: frustum (what lies in a frame's image), frustum+occlusion (and is not "
+        "hidden there; the default), frustum+occlusion+virtual (or is seen by virtual cameras), or all of them",
+    )  # fmt: skip
+    evaluate.add_argument(
+        "--views", type=int, default=0, metavar="N", help="render N frames in full for PSNR, SSIM and depth L1 (0)"
+    )
+    evaluate.add_argument("--device", help="cpu, cuda:0, ... (default: a GPU if there is one)")
     evaluate.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _eval(options: argparse.Namespace) -> int:
+    from warpslam.evaluation import DEFAULT_PROTOCOL, PROTOCOLS
     from warpslam.revisit import evaluate_run
     from warpslam.run_folder import RunFolder, to_json
 
+    quiet_warp()
+    # The default comes first, so that "reconstruction" is of the same protocol with and without the others.
+    protocols = [options.protocol or DEFAULT_PROTOCOL]
+    if options.protocol == "all":
+        protocols = sorted(PROTOCOLS, key=lambda name: name != DEFAULT_PROTOCOL)
     metrics = evaluate_run(
         RunFolder.open(options.run),
         options.truth,
         max_difference=options.max_difference,
         truth_mesh=options.truth_mesh,
+        protocols=protocols,
+        rendered_views=options.views,
+        device=options.device,
     )
     if options.json:
         print(to_json(metrics))
@@ -41,5 +61,7 @@ def _eval(options: argparse.Namespace) -> int:
         print(f"{name:16} RMSE {scale * values['rmse']:.3f} {unit}  {rest}")
     print(f"{'frames':16} {metrics['frames']['compared']} of {metrics['frames']['estimated']} compared")
     if "reconstruction" in metrics:
-        print_reconstruction(metrics["reconstruction"])
+        print_reconstruction(*metrics.get("reconstruction_by_protocol", {"": metrics["reconstruction"]}).values())
+    if "rendering" in metrics:
+        print_rendering(metrics["rendering"])
     return 0

@@ -7,14 +7,24 @@ from typing import Any
 
 from warpslam.cli.common import add_command, quiet_warp
 
+_DEFAULT_ROUNDS = 5
+
 
 def add(commands: Any) -> None:
     """Add the command."""
     mesh = add_command(commands, "mesh", _mesh, "extract the mesh of a run again")
     mesh.add_argument("run", metavar="RUN", help="run folder")
     mesh.add_argument("--voxel", type=float, metavar="M", help="edge of a marching-cubes cell [m]")
+    mesh.add_argument("--forecast", action="store_true", help="add, in cyan, what the coarse level expects unseen")
+    mesh.add_argument(
+        "--refine", type=int, nargs="?", const=_DEFAULT_ROUNDS, default=0, metavar="N",
+        help=f"refine the whole map before, in N more rounds ({_DEFAULT_ROUNDS}); the saved map stays as it is",
+    )  # fmt: skip
     mesh.add_argument("--device", help="cpu, cuda:0, ... (default: a GPU if there is one)")
-    mesh.add_argument("-o", "--output", metavar="FILE", help="PLY file (default: RUN/mesh.ply)")
+    mesh.add_argument(
+        "-o", "--output", metavar="FILE",
+        help=".ply or .glb file (default: RUN/mesh.ply, or RUN/mesh_forecast.ply with --forecast)",
+    )  # fmt: skip
 
 
 def _mesh(options: argparse.Namespace) -> int:
@@ -22,6 +32,14 @@ def _mesh(options: argparse.Namespace) -> int:
     from warpslam.run_folder import RunFolder
 
     quiet_warp()
-    mesh, path = extract_mesh(RunFolder.open(options.run), options.voxel, options.output, options.device)
-    print(f"{path}: {len(mesh.vertices)} vertices, {len(mesh.faces)} faces")
+    mesh, path = extract_mesh(
+        RunFolder.open(options.run),
+        options.voxel,
+        options.output,
+        options.device,
+        forecast=options.forecast,
+        refinement_rounds=options.refine,
+    )
+    extra = f", {mesh.metadata['forecast_faces']} of them forecast" if options.forecast else ""
+    print(f"{path}: {len(mesh.vertices)} vertices, {len(mesh.faces)} faces{extra}")
     return 0

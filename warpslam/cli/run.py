@@ -16,6 +16,7 @@ from warpslam.cli.common import (
     add_sequence_options,
     duration,
     print_reconstruction,
+    print_rendering,
     quiet_warp,
     warnings_on_stderr,
 )
@@ -40,7 +41,9 @@ def add(commands: Any) -> None:
     what.add_argument("folder", nargs="?", metavar="FOLDER", help="folder of one sequence")
     what.add_argument("--resume", metavar="RUN", help="go on with a run that was stopped, from its last checkpoint")
     add_sequence_options(run)
-    run.add_argument("--truth-mesh", metavar="FILE", help="true surface, for the reconstruction metrics")
+    run.add_argument(
+        "--gt-mesh", "--truth-mesh", dest="truth_mesh", metavar="FILE", help="true surface, for reconstruction metrics"
+    )
     run.add_argument("--map", metavar="FILE", help="start from the map of another run (its folder, or the file)")
     run.add_argument("--localize", action="store_true", help="with --map: only track the camera, leave the map alone")
     _add_method_options(run)
@@ -70,7 +73,7 @@ def _run(options: argparse.Namespace) -> int:
     from warpslam.checkpoint import saved_config
     from warpslam.config import Config
     from warpslam.errors import ConfigError
-    from warpslam.pipeline import load_mesh
+    from warpslam.evaluation import load_mesh
     from warpslam.revisit import open_source
     from warpslam.run_folder import RunFolder, Source
 
@@ -106,7 +109,7 @@ def _resume(options: argparse.Namespace) -> int:
     """Everything is as the checkpoint says; an option that says otherwise is refused by the run."""
     from warpslam.config import Config
     from warpslam.errors import ConfigError
-    from warpslam.pipeline import load_mesh
+    from warpslam.evaluation import load_mesh
     from warpslam.resume import read_checkpoint
     from warpslam.revisit import open_source
     from warpslam.run_folder import RunFolder
@@ -264,5 +267,5 @@ def _print_summary(result: RunResult) -> None:
         print_reconstruction(metrics["reconstruction"])
     rendering = metrics.get("rendering")
     if rendering:
-        print(f"rendering   depth L1 {100 * rendering['depth_l1_m']:.2f} cm, PSNR {rendering['psnr_db']:.1f} dB")
+        print_rendering(rendering)
     print(f"written to  {result.folder.path}")

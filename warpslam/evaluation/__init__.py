@@ -1,16 +1,25 @@
-"""How good a run is: trajectories (`ate`, `rpe`) and reconstructions (`evaluate_reconstruction`, `depth_l1`)."""
+"""How good a run is: trajectories (`ate`, `rpe`), reconstructions under named protocols, and rendered images."""
 
+from warpslam.evaluation.culling import (
+    DEFAULT_PROTOCOL,
+    PROTOCOLS,
+    Culling,
+    Views,
+    sample_surface,
+    visible_points,
+)
+from warpslam.evaluation.images import depth_l1, psnr, rendering_metrics, ssim
+from warpslam.evaluation.protocols import evaluate_mesh
 from warpslam.evaluation.reconstruction import (
     ReconstructionResult,
     accuracy,
     align_icp,
     completion,
     completion_ratio,
-    cull_mesh,
-    depth_l1,
     evaluate_reconstruction,
-    sample_surface,
-    visible_points,
+    f_score,
+    load_mesh,
+    reconstruction_metrics,
 )
 from warpslam.evaluation.trajectory import (
     AteResult,
@@ -21,15 +30,22 @@ from warpslam.evaluation.trajectory import (
     ate,
     read_tum,
     rpe,
+    trajectory_metrics,
     transform_poses,
     write_tum,
 )
+from warpslam.evaluation.virtual_views import VirtualDepth, virtual_depth
 
 __all__ = [
+    "DEFAULT_PROTOCOL",
+    "PROTOCOLS",
     "AteResult",
+    "Culling",
     "ReconstructionResult",
     "RpeResult",
     "Statistics",
+    "Views",
+    "VirtualDepth",
     "accuracy",
     "align_horn",
     "align_icp",
@@ -37,13 +53,21 @@ __all__ = [
     "ate",
     "completion",
     "completion_ratio",
-    "cull_mesh",
     "depth_l1",
+    "evaluate_mesh",
     "evaluate_reconstruction",
+    "f_score",
+    "load_mesh",
+    "psnr",
     "read_tum",
+    "reconstruction_metrics",
+    "rendering_metrics",
     "rpe",
     "sample_surface",
+    "ssim",
+    "trajectory_metrics",
     "transform_poses",
+    "virtual_depth",
     "visible_points",
     "write_tum",
 ]

@@ -1,141 +1,150 @@
-"""Reconstruction errors as the paper measures them (Sec. 4.1): accuracy, completion, completion ratio, depth L1.
+"""Reconstruction errors (Sec. 4.1): distances between surfaces, and depth on virtual views.
 
-    accuracy          mean distance from a point of the reconstruction to the true surface            [m]
-    completion        mean distance from a point of the true surface to the reconstruction            [m]
-    completion ratio  share of points of the true surface closer than 5 cm to the reconstruction      [0..1]
-    depth L1          mean |rendered - true depth|                                                    [m]
+    accuracy             mean distance from a point of the reconstruction to the true surface             [m]
+    completion           mean distance from a point of the true surface to the reconstruction             [m]
+    accuracy ratio       share of points of the reconstruction closer than 5 cm to the true surface       [0..1]
+    completion ratio     share of points of the true surface closer than 5 cm to the reconstruction       [0..1]
+    F-score              2 a c / (a + c) of the two ratios                                                [0..1]
+    normal consistency   mean |n . n'| of a point's normal and that of its nearest point, both ways       [0..1]
+    depth L1             mean |depth of the reconstruction - true depth| seen from virtual cameras        [m]
 
 Points are drawn uniformly over each surface, 200,000 a mesh; distances are to the nearest drawn point of the other one.
-So two equal meshes are 0.5 / sqrt(points per square metre) apart, 1 cm for a room of 80 square metres. Only
-what the cameras saw counts: both meshes are culled with the same views first.
+So two equal meshes are 0.5 / sqrt(points per square metre) apart, 1 cm for a room of 80 square metres. Only what counts
+under a protocol (`warpslam.evaluation.culling`) is drawn, of both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpslam.camera import Intrinsics
 from warpslam.errors import InputError, MeshError
+from warpslam.evaluation.culling import SAMPLE_COUNT, Culling, sample_surface
 from warpslam.evaluation.trajectory import align_horn
 
 if TYPE_CHECKING:
     import trimesh
 
-SAMPLE_COUNT = 200_000
+    from warpslam.evaluation.virtual_views import VirtualDepth
+
 RATIO_DISTANCE = 0.05  # [m]
-OCCLUSION_TOLERANCE = 0.05  # [m]
 
 
 @dataclass(frozen=True)
 class ReconstructionResult:
-    """Distances [m] between a reconstruction and the true surface.
+    """Distances [m] between a reconstruction and the true surface, and shares, 0..1.
 
-    completion_ratio: Share, 0..1, of the true surface closer than 5 cm.
+    protocol: What was compared, one of `warpslam.evaluation.PROTOCOLS`; None for all of both surfaces.
+    sample_count: Points drawn on the smaller of the two samples.
     T_truth_mesh: Transform that was applied to the reconstruction, (4, 4); identity without alignment.
+    virtual_depth: Depth on virtual views; None where it was not asked for.
     """
 
+    protocol: str | None
     accuracy: float
     completion: float
+    accuracy_ratio: float
     completion_ratio: float
+    f_score: float
+    normal_consistency: float
     sample_count: int
     T_truth_mesh: np.ndarray
+    virtual_depth: VirtualDepth | None = None
 
 
 def evaluate_reconstruction(
     mesh: trimesh.Trimesh,
     truth: trimesh.Trimesh,
     *,
-    seen_truth: trimesh.Trimesh | None = None,
+    culling: Culling | None = None,
     sample_count: int = SAMPLE_COUNT,
     align: bool = True,
     seed: int = 0,
 ) -> ReconstructionResult:
-    """Compare two meshes. What the cameras can't have seen is for the caller to cull first (`cull_mesh`).
+    """Compare two meshes.
 
     Args:
         mesh: Reconstruction [m].
-        truth: True surface [m], against which accuracy is taken.
-        seen_truth: Part of the true surface that completion is asked of; None for all of it.
+        truth: True surface [m].
+        culling: What of both counts; None for all.
         sample_count: Points drawn a mesh.
-        align: Refine the pose of the reconstruction by point-to-point ICP within 10 cm first, as the protocol has it.
+        align: Refine the pose of the reconstruction by point-to-point ICP within 10 cm first, as the paper does.
         seed: Seed of the drawn points.
 
     Raises:
-        MeshError: A mesh has no surface.
+        MeshError: A mesh has no surface, or none that counts.
     """
-    points = sample_surface(mesh, sample_count, seed)
-    truth_points = sample_surface(truth, sample_count, seed + 1)
+    points, normals = sample_surface(mesh, sample_count, seed, culling=culling)
+    truth_points, truth_normals = sample_surface(truth, sample_count, seed + 1, culling=culling)
     T = align_icp(points, truth_points) if align else np.eye(4)
-    points = points @ T[:3, :3].T + T[:3, 3]
-    asked = truth_points if seen_truth is None else sample_surface(seen_truth, sample_count, seed + 2)
-    to_mesh = _distances(asked, points)
+    points, normals = points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T
+    to_truth, nearest_truth = _nearest(points, truth_points)
+    to_mesh, nearest = _nearest(truth_points, points)
+    share, truth_share = (float((d < RATIO_DISTANCE).mean()) for d in (to_truth, to_mesh))
+    agreement = [
+        np.abs((normals * truth_normals[nearest_truth]).sum(axis=1)).mean(),
+        np.abs((truth_normals * normals[nearest]).sum(axis=1)).mean(),
+    ]
     return ReconstructionResult(
-        accuracy=accuracy(points, truth_points),
+        protocol=None if culling is None else culling.protocol,
+        accuracy=float(to_truth.mean()),
         completion=float(to_mesh.mean()),
-        completion_ratio=float((to_mesh < RATIO_DISTANCE).mean()),
-        sample_count=sample_count,
+        accuracy_ratio=share,
+        completion_ratio=truth_share,
+        f_score=f_score(share, truth_share),
+        normal_consistency=float(np.mean(agreement)),
+        sample_count=min(len(points), len(truth_points)),
         T_truth_mesh=T,
     )
 
 
+def reconstruction_metrics(result: ReconstructionResult) -> dict[str, Any]:
+    """The figures of a reconstruction, named with their units, and the protocol they hold under."""
+    metrics: dict[str, Any] = {
+        "protocol": result.protocol,
+        "accuracy_m": result.accuracy,
+        "completion_m": result.completion,
+        "accuracy_ratio_5cm": result.accuracy_ratio,
+        "completion_ratio_5cm": result.completion_ratio,
+        "f_score_5cm": result.f_score,
+        "normal_consistency": result.normal_consistency,
+        "samples": result.sample_count,
+        "T_truth_mesh": result.T_truth_mesh,
+    }
+    depth = result.virtual_depth
+    if depth is not None:
+        metrics["depth_l1_m"] = depth.l1
+        metrics["virtual_views"] = {
+            "used": depth.view_count,
+            "drawn": depth.drawn_count,
+            "missed_share": depth.missed_share,
+            "depth_l1_misses_as_zero_m": depth.l1_misses_as_zero,
+        }
+    return metrics
+
+
 def accuracy(points: np.ndarray, truth_points: np.ndarray) -> float:
     """Mean distance [m] from each reconstructed point (N, 3) to the nearest true point (M, 3)."""
-    return float(_distances(points, truth_points).mean())
+    return float(_nearest(points, truth_points)[0].mean())
 
 
 def completion(points: np.ndarray, truth_points: np.ndarray) -> float:
     """Mean distance [m] from each true point (M, 3) to the nearest reconstructed point (N, 3)."""
-    return float(_distances(truth_points, points).mean())
+    return float(_nearest(truth_points, points)[0].mean())
 
 
 def completion_ratio(points: np.ndarray, truth_points: np.ndarray, distance: float = RATIO_DISTANCE) -> float:
     """Share, 0..1, of the true points (M, 3) that lie closer than ``distance`` [m] to a reconstructed point (N, 3)."""
-    return float((_distances(truth_points, points) < distance).mean())
+    return float((_nearest(truth_points, points)[0] < distance).mean())
 
 
-def depth_l1(depth: np.ndarray, truth: np.ndarray, *, all_pixels: bool = False) -> float:
-    """Mean |depth - truth| [m] of two depth images (H, W), 0 = no surface.
-
-    Args:
-        depth: Rendered depth [m].
-        truth: True or measured depth [m].
-        all_pixels: Average over all pixels, a miss counting as depth 0 (the paper's protocol on meshes); else over the
-            pixels where ``truth`` has a value. NaN then if it has none.
-
-    Raises:
-        InputError: Shapes differ.
-    """
-    depth, truth = np.asarray(depth, dtype=np.float64), np.asarray(truth, dtype=np.float64)
-    if depth.shape != truth.shape:
-        raise InputError(f"depth {depth.shape} and truth {truth.shape} must have the same shape")
-    counted = np.ones(truth.shape, dtype=bool) if all_pixels else truth > 0
-    return float(np.abs(depth - truth)[counted].mean()) if counted.any() else float("nan")
-
-
-def sample_surface(mesh: trimesh.Trimesh, count: int = SAMPLE_COUNT, seed: int = 0) -> np.ndarray:
-    """Points drawn uniformly over the surface of ``mesh``, float64, shape (count, 3).
-
-    Raises:
-        MeshError: The mesh has no face with an area, or a vertex that is not finite.
-    """
-    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3)) if len(faces) else (np.zeros((0, 3)),) * 3
-    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    if not np.isfinite(areas).all():
-        raise MeshError("the mesh has a vertex that is NaN or infinite, so its surface can't be sampled")
-    if areas.sum() <= 0:
-        raise MeshError(f"the mesh ({len(vertices)} vertices, {len(faces)} faces) has no surface to sample")
-    rng = np.random.default_rng(seed)
-    face = rng.choice(len(areas), size=count, p=areas / areas.sum())
-    # Folding the unit square's upper half onto the lower one draws uniformly over the triangle.
-    u, v = rng.random((2, count, 1))
-    folded = u + v > 1
-    u, v = np.where(folded, 1 - u, u), np.where(folded, 1 - v, v)
-    return a[face] + u * (b - a)[face] + v * (c - a)[face]
+def f_score(accuracy_ratio: float, completion_ratio: float) -> float:
+    """Harmonic mean of the two shares, 0..1."""
+    total = accuracy_ratio + completion_ratio
+    return 2.0 * accuracy_ratio * completion_ratio / total if total > 0 else 0.0
 
 
 def align_icp(
@@ -166,88 +175,27 @@ def align_icp(
     return T
 
 
-def visible_points(
-    points: np.ndarray,
-    poses: np.ndarray,
-    intrinsics: Intrinsics,
-    depths: Iterable[np.ndarray] | None = None,
-    *,
-    tolerance: float = OCCLUSION_TOLERANCE,
-) -> np.ndarray:
-    """Which points any of the cameras saw, bool, shape (N,).
-
-    Args:
-        points: World points [m], shape (N, 3).
-        poses: Camera-to-world transforms, shape (F, 4, 4); a view with an unknown (NaN) pose is skipped.
-        intrinsics: Camera of all views.
-        depths: One depth image (H, W) [m] a view, 0 = missing. With it a point counts only where it is no more than
-            ``tolerance`` behind the depth of its pixel; without it, wherever it projects into the image.
-        tolerance: Accepted distance behind the depth [m].
-    """
-    points = np.asarray(points, dtype=np.float64)
-    seen = np.zeros(len(points), dtype=bool)
-    depth_images = iter(depths) if depths is not None else None
-    for T_world_camera in np.asarray(poses, dtype=np.float64):
-        depth = next(depth_images) if depth_images is not None else None
-        if not np.isfinite(T_world_camera).all():
-            continue
-        # Only points not seen so far are projected: after a few views these are a fraction.
-        rest = np.flatnonzero(~seen)
-        R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
-        x, y, z = ((points[rest] - t) @ R).T
-        in_front = z > 1e-6
-        rest, x, y, z = rest[in_front], x[in_front], y[in_front], z[in_front]
-        column = np.rint(intrinsics.fx * x / z + intrinsics.cx)
-        row = np.rint(intrinsics.fy * y / z + intrinsics.cy)
-        inside = (column >= 0) & (column < intrinsics.width) & (row >= 0) & (row < intrinsics.height)
-        if depth is not None:
-            surface = depth[row[inside].astype(int), column[inside].astype(int)]
-            inside[inside] = (surface > 0) & (z[inside] <= surface + tolerance)
-        seen[rest[inside]] = True
-    return seen
-
-
-def cull_mesh(
-    mesh: trimesh.Trimesh,
-    poses: np.ndarray,
-    intrinsics: Intrinsics,
-    depths: Iterable[np.ndarray] | None = None,
-    *,
-    tolerance: float = OCCLUSION_TOLERANCE,
-    max_edge: float | None = None,
-) -> trimesh.Trimesh:
-    """The part of ``mesh`` that the cameras saw: faces with at least one vertex that `visible_points` marks.
-
-    Args:
-        mesh: Mesh [m] in the world frame of the poses.
-        poses: As in `visible_points`.
-        intrinsics: As in `visible_points`.
-        depths: As in `visible_points`.
-        tolerance: As in `visible_points`.
-        max_edge: Split faces until no edge is longer [m], so that a large triangle is cut where the view ends; None
-            leaves the faces as they are.
+def load_mesh(path: str | Path) -> trimesh.Trimesh:
+    """Read a triangle mesh; its shape only, textures are left out.
 
     Raises:
-        MeshError: The cameras saw nothing of the mesh.
+        MeshError: The file can't be read or holds no triangles.
     """
     import trimesh
 
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    if max_edge is not None and len(faces):
-        vertices, faces = trimesh.remesh.subdivide_to_size(vertices, faces, max_edge=max_edge, max_iter=20)
-    seen = visible_points(vertices, poses, intrinsics, depths, tolerance=tolerance)
-    kept = faces[seen[faces].any(axis=1)] if len(faces) else faces
-    if len(kept) == 0:
-        raise MeshError(f"none of the {len(faces)} faces was seen by any of the {len(poses)} cameras")
-    used, inverse = np.unique(kept, return_inverse=True)
-    return trimesh.Trimesh(vertices[used], inverse.reshape(-1, 3), process=False)
+    try:
+        mesh = trimesh.load(str(path), force="mesh", process=False, skip_materials=True)
+    except Exception as error:  # trimesh lets its parsers' own exceptions through
+        raise MeshError(f"{path}: can't be read as a mesh ({error})") from error
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise MeshError(f"{path}: holds no triangles")
+    return mesh
 
 
-def _distances(points: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Distance of each of ``points`` (N, 3) to the nearest of ``others`` (M, 3)."""
+def _nearest(points: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of each of ``points`` (N, 3) to the nearest of ``others`` (M, 3), and which one that is."""
     from scipy.spatial import cKDTree
 
     if len(points) == 0 or len(others) == 0:
         raise InputError(f"there are no distances between {len(points)} and {len(others)} points")
-    distances, _ = cKDTree(others).query(points, workers=-1)
-    return distances
+    return cKDTree(others).query(points, workers=-1)

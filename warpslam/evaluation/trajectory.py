@@ -9,13 +9,17 @@ orientation using unit quaternions, JOSA A 1987 (solved here by SVD, after Kabsc
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from warpslam.camera import pose_from_vector, vector_from_pose
 from warpslam.errors import DatasetError, InputError
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -147,6 +151,33 @@ def rpe(estimate: np.ndarray, truth: np.ndarray, delta: int = 1) -> RpeResult:
     )
 
 
+def trajectory_metrics(poses: np.ndarray, truth: np.ndarray) -> dict[str, Any]:
+    """ATE with and without alignment, and RPE from frame to frame, of poses (N, 4, 4) against truth (N, 4, 4).
+
+    Raises:
+        InputError: As `ate` does. Without two neighbours of known truth there is no RPE.
+    """
+    aligned = ate(poses, truth)
+    metrics: dict[str, Any] = {
+        "ate_m": {
+            "aligned": _figures(aligned),
+            "unaligned": _figures(ate(poses, truth, align=False)),
+            "frames_without_truth": aligned.skipped_count,
+        }
+    }
+    try:
+        relative = rpe(poses, truth)
+    except InputError as error:
+        log.info("no relative error: %s", error)
+    else:
+        metrics["rpe"] = {
+            "delta_frames": relative.delta,
+            "translation_m": _figures(relative.translation),
+            "rotation_deg": _figures(relative.rotation),
+        }
+    return metrics
+
+
 def rotation_angles(R: np.ndarray) -> np.ndarray:
     """Angle [rad] of each rotation, R of shape (N, 3, 3), accurate near 0 and near pi alike."""
     # arccos of the trace loses half the digits near 0 and pi; atan2 of sine and cosine does not.
@@ -230,6 +261,10 @@ def _checked(estimate: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.nd
     if len(bad):
         raise InputError(f"{len(bad)} estimated poses hold NaN or infinity, the first is frame {bad[0]}")
     return estimate, truth, np.isfinite(truth).all(axis=(1, 2))
+
+
+def _figures(error: Statistics) -> dict[str, float]:
+    return {name: getattr(error, name) for name in ("rmse", "mean", "median", "std", "min", "max")}
 
 
 def _summary(errors: np.ndarray) -> dict[str, float]:

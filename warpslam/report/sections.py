@@ -203,7 +203,7 @@ def images_section(run: RunData) -> Html:
     """Input, rendering and difference of some frames."""
     if not run.panels:
         return section("images", "Input and rendering", missing("The run rendered no images of its map."))
-    from warpslam.pipeline import psnr
+    from warpslam.evaluation import psnr
 
     measured = np.concatenate([panel.depth[panel.depth > 0] for panel in run.panels])
     near, far = np.percentile(measured, [1, 99]) if len(measured) else (0.0, 1.0)
@@ -277,7 +277,7 @@ def mesh_section(run: RunData) -> Html:
 
 def views_of(run: RunData, limit: int | None = None) -> list[MeshView]:
     """Pictures of the run's mesh; none where it has no mesh, or one that can't be read any more."""
-    from warpslam.pipeline import load_mesh
+    from warpslam.evaluation import load_mesh
 
     if not run.folder.mesh.is_file():
         return []

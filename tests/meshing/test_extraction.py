@@ -1,110 +1,20 @@
-"""The mesh of an analytic scene: a ball in a box room, seen by cameras whose depth is computed in closed form."""
+"""The mesh of the room with the ball: where its surface lies, where it ends, and what is an error."""
 
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
-import warp as wp
 
+from tests.meshing.ball_room import CAMERA, OFFSET, RADIUS, ROOM, BallRoom, open_edges, view
 from warpslam.camera import Intrinsics
 from warpslam.errors import InputError, MeshError
-from warpslam.meshing import ObservedView, _Evidence, _Surface, extract_mesh, write_ply
-
-ROOM = np.array([1.2, 1.0, 0.8])  # half extents [m]
-OFFSET = np.array([0.013, -0.007, 0.004])  # keeps the walls off the lattice planes
-RADIUS = 0.3
-CAMERA = Intrinsics(40.0, 40.0, 39.5, 29.5, 80, 60)
-
-
-@dataclass
-class BallRoom:
-    """Free between the walls and outside the ball; the logit is 10 times the distance [m] into the solid."""
-
-    bounds: tuple = (-ROOM - 0.3, ROOM + 0.3)
-    poison: float = 0.0
-    asked: int = 0
-
-    def distance(self, points):
-        """Signed distance (N,) to the nearest surface [m], positive in free space."""
-        p = np.asarray(points, dtype=np.float64) - OFFSET
-        return np.minimum((ROOM - np.abs(p)).min(axis=1), np.linalg.norm(p, axis=1) - RADIUS)
-
-    def query_occupancy(self, points, level="fine"):
-        """Logits; the value `poison` is added where x > 0, to damage the field."""
-        assert level == "fine" and points.dtype == np.float32
-        self.asked += len(points)
-        logits = (-10.0 * self.distance(points)).astype(np.float32)
-        logits[points[:, 0] > 0] += np.float32(self.poison)
-        return logits
-
-    def query_color(self, points):
-        """A colour that changes with the place."""
-        return (0.5 + 0.25 * points).astype(np.float32)
-
-
-def look(position, target):
-    """Camera at `position` that looks at `target`, world z up."""
-    position, target = np.asarray(position, float) + OFFSET, np.asarray(target, float) + OFFSET
-    forward = (target - position) / np.linalg.norm(target - position)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
-    T[:3, 3] = position
-    return T
-
-
-def render(T, camera=CAMERA):
-    """Exact z-depth of the room with the ball, from inside it."""
-    v, u = np.mgrid[: camera.height, : camera.width]
-    local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-    ray, origin = local @ T[:3, :3].T, T[:3, 3] - OFFSET
-    with np.errstate(divide="ignore", invalid="ignore"):
-        wall = np.where(ray != 0, (np.sign(ray) * ROOM - origin) / ray, np.inf).min(axis=-1)
-        a, b, c = (ray**2).sum(-1), ray @ origin, origin @ origin - RADIUS**2
-        ball = (-b - np.sqrt(b * b - a * c)) / a
-    return np.where(ball > 0, np.minimum(wall, ball), wall).astype(np.float32)
-
-
-def view(position, target, camera=CAMERA):
-    """The observed view from `position` to `target`."""
-    T = look(position, target)
-    return ObservedView(render(T, camera), camera, T)
-
-
-def views_of_everything():
-    """Cameras in the corners that look across the room: every wall and the whole ball are seen."""
-    corners = [(x, y, z) for x in (-1, 1) for y in (-0.8, 0.8) for z in (-0.6, 0.6)]
-    outward = [view((0.3 * x, 0.8 * y, 0.5 * z), (1.2 * x, y, 0.8 * z)) for x, y, z in corners]
-    return [view(corner, (0, 0, 0)) for corner in corners] + outward
-
-
-def open_edges(faces):
-    """Directed edges without exactly one opposite edge."""
-    count = Counter(map(tuple, np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()))
-    return [edge for edge, n in count.items() if n != 1 or count[edge[::-1]] != 1]
-
-
-@pytest.fixture(scope="module", params=["cpu"] + (["cuda:0"] if wp.is_cuda_available() else []))
-def device(request):
-    """Every Warp device of this machine."""
-    return request.param
-
-
-@pytest.fixture(scope="module")
-def everything():
-    """All views of the room."""
-    return views_of_everything()
-
-
-@pytest.fixture(scope="module")
-def mesh(everything, device):
-    """The room at 2 cm with everything seen."""
-    return extract_mesh(BallRoom(), everything, device=device)
+from warpslam.meshing import ObservedView, extract_mesh
+from warpslam.meshing.marching_cubes import Surface
+from warpslam.meshing.views import Evidence
 
 
 def test_vertices_lie_on_the_surface(mesh):
@@ -188,7 +98,7 @@ def test_open_edges_only_at_the_border_of_sight(device):
     middles = np.array([mesh.vertices[list(edge)].mean(axis=0) for edge in open_edges(mesh.faces)])
     assert len(middles) > 20
     lo, hi = (np.floor(corner / 0.02).astype(int) for corner in BallRoom().bounds)
-    evidence = _Evidence([single], 0.1, 0.15, device)
+    evidence = Evidence([single], 0.1, 0.15, device)
     observed, _ = evidence.classify(lo, tuple(hi - lo + 1), np.zeros(1, np.int32), 0.02)
     cell = np.floor(middles / 0.02).astype(int) - lo
     for i, j, k in cell:
@@ -234,12 +144,29 @@ def test_missing_depth_is_no_evidence(device):
     assert extract_mesh(BallRoom(), [whole], device=device).vertices[:, 0].min() < -0.5
 
 
-def test_small_components_are_dropped(everything, device):
-    """The ball (1.13 m^2) goes when pieces below 2 m^2 are dropped."""
-    mesh = extract_mesh(BallRoom(), everything, voxel=0.04, min_component_area=2.0, device=device)
-    assert np.linalg.norm(mesh.vertices - OFFSET, axis=1).min() > 0.7
+class Floater(BallRoom):
+    """A second ball of 10 cm in free space, which no camera measured: they look through it."""
+
+    def query_occupancy(self, points, level="fine"):
+        d = np.linalg.norm(points - np.array([0.7, 0.5, 0.3]) - OFFSET, axis=1) - 0.1
+        return np.maximum(super().query_occupancy(points, level), -10 * d).astype(np.float32)
+
+
+def test_small_components_are_dropped_unless_measured(everything, device):
+    """Of two balls, both below the least area, the one that the depth images show stays and the floating one goes."""
+    settings = {"voxel": 0.04, "band": None, "device": device}
+    mesh = extract_mesh(Floater(), everything, min_component_area=2.0, **settings)
+    floating = np.linalg.norm(mesh.vertices - OFFSET - [0.7, 0.5, 0.3], axis=1) < 0.15
+    on_ball = np.linalg.norm(mesh.vertices - OFFSET, axis=1) < 0.35
+    assert on_ball.sum() > 500 and not floating.any()
+    kept = extract_mesh(Floater(), everything, min_component_area=0.05, **settings)
+    assert (np.linalg.norm(kept.vertices - OFFSET - [0.7, 0.5, 0.3], axis=1) < 0.15).sum() > 50
+
+
+def test_small_and_unmeasured_is_an_error(everything, device):
+    """A surface 8 cm in front of everything that was measured, all of whose pieces are too small."""
     with pytest.raises(MeshError, match="min_component_area"):
-        extract_mesh(BallRoom(), everything, voxel=0.04, min_component_area=500.0, device=device)
+        extract_mesh(BallRoom(), everything, voxel=0.04, level_set=-0.8, min_component_area=500.0, device=device)
 
 
 def test_level_set_moves_the_surface(everything, device):
@@ -261,9 +188,9 @@ def test_any_field_gives_a_closed_surface(seed):
     n = 24
     logits = np.random.default_rng(seed).normal(size=(n, n, n)).astype(np.float32)
     logits[[0, -1]] = logits[:, [0, -1]] = logits[:, :, [0, -1]] = -1.0
-    surface = _Surface(np.zeros(3, int), np.full(3, n - 1), 0.1)
+    surface = Surface(np.zeros(3, int), np.full(3, n - 1), 0.1)
     surface.add_block(logits, np.ones((n - 1,) * 3, bool), np.zeros(3, int), 0.0)
-    vertices, faces = surface.merged()
+    vertices, faces, _ = surface.merged()
     directed = Counter(map(tuple, np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()))
     assert len(faces) > 10000 and all(directed[b, a] == n for (a, b), n in directed.items())
     volume = trimesh.Trimesh(vertices, faces, process=False).volume
@@ -323,23 +250,3 @@ def test_depth_must_fit_the_camera():
     """A resized image with the old intrinsics is refused, with the remedy."""
     with pytest.raises(InputError, match="scaled"):
         ObservedView(np.ones((30, 40), np.float32), CAMERA, np.eye(4))
-
-
-def test_ply_holds_normals_and_colors(mesh, tmp_path):
-    """A written file reloads with the same faces, positions, normals and colours, and is binary."""
-    path = write_ply(mesh, tmp_path / "mesh.ply")
-    header = path.read_bytes()[:60]
-    assert b"binary_little_endian" in header and [p.name for p in tmp_path.iterdir()] == ["mesh.ply"]
-    loaded = trimesh.load(path, process=False)
-    assert np.array_equal(loaded.faces, mesh.faces)
-    assert loaded.vertices == pytest.approx(mesh.vertices, abs=1e-6)
-    assert loaded.vertex_normals == pytest.approx(mesh.vertex_normals, abs=1e-6)
-    assert np.array_equal(loaded.visual.vertex_colors, mesh.visual.vertex_colors)
-
-
-def test_unwritable_ply_is_an_error(mesh, tmp_path):
-    """A missing folder and an empty mesh are named."""
-    with pytest.raises(MeshError, match="nowhere"):
-        write_ply(mesh, tmp_path / "nowhere" / "mesh.ply")
-    with pytest.raises(MeshError, match="no faces"):
-        write_ply(trimesh.Trimesh(), tmp_path / "mesh.ply")

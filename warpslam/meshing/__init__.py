@@ -1,0 +1,15 @@
+"""Meshes of the map (supplement A.4): extraction, forecast, cleaning, files. Importing this imports Warp."""
+
+from warpslam.meshing.extraction import FREE_LOGIT, UNOBSERVED_LOGIT, Field, extract_mesh
+from warpslam.meshing.files import check_mesh_path, write_mesh
+from warpslam.meshing.views import ObservedView
+
+__all__ = [
+    "FREE_LOGIT",
+    "UNOBSERVED_LOGIT",
+    "Field",
+    "ObservedView",
+    "check_mesh_path",
+    "extract_mesh",
+    "write_mesh",
+]
