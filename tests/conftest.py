@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,17 @@ def _shared_path(variable: str, default: str) -> Path:
 def data_dir() -> Path:
     """Folder with the test sequences, one folder each."""
     return _shared_path("WARPSLAM_DATA", "data")
+
+
+@pytest.fixture
+def small_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer points and virtual views than the protocols have."""
+    from warpslam.evaluation import protocols, virtual_views
+
+    few_points = partial(protocols.evaluate_reconstruction, sample_count=20_000)
+    monkeypatch.setattr(protocols, "evaluate_reconstruction", few_points)
+    monkeypatch.setattr(virtual_views, "VIEW_COUNT", 2)
+    monkeypatch.setattr(virtual_views, "CULLING_VIEW_COUNT", 4)
 
 
 @pytest.fixture(scope="session")

@@ -174,12 +174,22 @@ def test_eval_prints_figures(faked, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["ate_m"]["unaligned"]["rmse"] == pytest.approx(rmse / 100, abs=5e-9)
 
 
-def test_eval_compares_the_mesh(faked, tmp_path, capsys):
-    """With a true surface on the command line the reconstruction figures are printed."""
-    cli.main(["run", "seq", "-o", str(tmp_path / "run"), "--frames", "0:3"])
+def test_eval_compares_the_mesh(faked, small_evaluation, tmp_path, capsys):
+    """With a true surface a table names the protocol; --protocol all has a line for each, --views the renderings."""
+    run = str(tmp_path / "run")
+    cli.main(["run", "seq", "-o", run, "--frames", "0:3"])
     wall().export(tmp_path / "wall.ply")
-    assert cli.main(["eval", str(tmp_path / "run"), "--truth-mesh", str(tmp_path / "wall.ply")]) == 0
-    assert "100.00 %" in capsys.readouterr().out
+    capsys.readouterr()
+    assert cli.main(["eval", run, "--truth-mesh", str(tmp_path / "wall.ply"), "--views", "1"]) == 0
+    out = capsys.readouterr().out
+    (line,) = (line for line in out.splitlines() if line.startswith("frustum"))
+    assert line.split()[0] == "frustum+occlusion" and "100.00 %" in line
+    assert "SSIM" in out and "1 frames" in out
+    assert cli.main(["eval", run, "--gt-mesh", str(tmp_path / "wall.ply"), "--protocol", "all"]) == 0
+    names = [line.split()[0] for line in capsys.readouterr().out.splitlines() if line.startswith("frustum")]
+    assert names == ["frustum+occlusion", "frustum", "frustum+occlusion+virtual"]
+    assert cli.main(["eval", run, "--gt-mesh", str(tmp_path / "wall.ply"), "--protocol", "visible"]) == 2
+    assert "choose one of frustum," in capsys.readouterr().err
 
 
 def test_render_and_mesh_of_a_run(faked, tmp_path, capsys):
@@ -189,10 +199,13 @@ def test_render_and_mesh_of_a_run(faked, tmp_path, capsys):
     assert cli.main(["render", run, "--frame", "2", "-o", str(tmp_path / "two.png")]) == 0
     assert cli.main(["mesh", run, "--voxel", "0.05", "-o", str(tmp_path / "m.ply")]) == 0
     assert (tmp_path / "two.png").stat().st_size > 1000
-    assert f"{tmp_path / 'm.ply'}: 4 vertices, 2 faces" in capsys.readouterr().out
+    assert f"{tmp_path / 'm.ply'}: 4 vertices, 2 faces\n" in capsys.readouterr().out
+    assert cli.main(["mesh", run, "--forecast", "--refine"]) == 0
+    out = capsys.readouterr().out
+    assert f"{tmp_path / 'run' / 'mesh_forecast.ply'}: 4 vertices, 2 faces, 1 of them forecast" in out
 
 
-def test_demo_runs_on_its_own_sequence(faked, tmp_path, monkeypatch, capsys):
+def test_demo_runs_on_its_own_sequence(faked, small_evaluation, tmp_path, monkeypatch, capsys):
     """The demo needs no data, prints ATE and surface accuracy, and its settings can be overridden."""
 
     class Demo(FakeSequence):

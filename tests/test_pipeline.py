@@ -15,7 +15,7 @@ from tests.fakes import FakeSequence, FakeSlam, true_pose, wall
 from warpslam import pipeline, revisit
 from warpslam.config import Config
 from warpslam.errors import ConfigError, DatasetError, InputError, MeshError
-from warpslam.evaluation import load_mesh, read_tum
+from warpslam.evaluation import load_mesh, psnr, read_tum, ssim
 from warpslam.plots import load_panels, top_view_axes
 from warpslam.run_folder import RunFolder, Source, read_json, to_json
 
@@ -26,14 +26,20 @@ def fake_slam(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
 
     class Slam(FakeSlam):
         made: list[FakeSlam] = []
+        loaded: list[FakeSlam] = []
 
     def build(intrinsics, config, device, seed):
         Slam.made.append(Slam(intrinsics, config=config, device=device, seed=seed))
         return Slam.made[-1]
 
     monkeypatch.setattr(pipeline, "build_slam", build)
-    monkeypatch.setattr(pipeline, "load_slam", lambda folder, device=None: Slam.load(folder.map, device))
-    monkeypatch.setattr(revisit, "load_slam", lambda folder, device=None: Slam.load(folder.map, device))
+
+    def load(folder, device=None):
+        Slam.loaded.append(Slam.load(folder.map, device))
+        return Slam.loaded[-1]
+
+    monkeypatch.setattr(pipeline, "load_slam", load)
+    monkeypatch.setattr(revisit, "load_slam", load)
     monkeypatch.setattr("warpslam.report.images.SUPERSAMPLING", 1)
     return Slam
 
@@ -192,12 +198,69 @@ def test_partial_ground_truth_and_lost_frames(fake_slam, tmp_path):
     assert len(read_tum(result.folder.ground_truth)[0]) == 7
 
 
-def test_reconstruction_against_a_truth_mesh(fake_slam, tmp_path):
-    """The fake's mesh is the true wall: all of what was seen is covered."""
+def test_reconstruction_against_a_truth_mesh(fake_slam, small_evaluation, tmp_path):
+    """The fake's mesh is the true wall: all of what was seen is covered, and the protocol is named."""
     result = pipeline.run(FakeSequence(2), Config(), tmp_path, truth_mesh=wall())
     figures = result.metrics["reconstruction"]
-    assert figures["completion_ratio_5cm"] == 1.0
+    assert figures["protocol"] == result.reconstruction.protocol == "frustum+occlusion"
+    assert figures["completion_ratio_5cm"] == figures["f_score_5cm"] == 1.0
     assert figures["accuracy_m"] < 0.02 and figures["completion_m"] < 0.02
+    # So small an image shows hardly a whole virtual view; where there is one, it is exact.
+    assert 2 <= figures["virtual_views"]["drawn"] <= 40
+    assert figures["virtual_views"]["used"] == 0 or figures["depth_l1_m"] == pytest.approx(0, abs=1e-6)
+
+
+def test_evaluate_run_has_the_figures_of_the_run(fake_slam, small_evaluation, tmp_path, monkeypatch):
+    """What metrics.json says of the surface, the files of the run say as well, although its own poses are 1 cm off."""
+    monkeypatch.setattr(revisit, "open_source", lambda source: FakeSequence(3))
+    wall().export(tmp_path / "wall.ply")
+    result = pipeline.run(FakeSequence(3), Config(), tmp_path / "run", truth_mesh=wall(), source=Source("x"), seed=5)
+    again = revisit.evaluate_run(result.folder, truth_mesh=tmp_path / "wall.ply")["reconstruction"]
+    written = metrics_of(tmp_path / "run")["reconstruction"]
+    for name in ("accuracy_m", "completion_m", "completion_ratio_5cm", "f_score_5cm"):
+        assert again[name] == pytest.approx(written[name], abs=1e-6), name
+    assert again["virtual_views"] == pytest.approx(written["virtual_views"], abs=1e-6)
+
+
+def test_evaluate_run_under_every_protocol(fake_slam, small_evaluation, tmp_path, monkeypatch):
+    """The first protocol is the one in its usual place; each set of figures says which it is."""
+    monkeypatch.setattr(revisit, "open_source", lambda source: FakeSequence(2))
+    wall().export(tmp_path / "wall.ply")
+    result = pipeline.run(FakeSequence(2), Config(), tmp_path / "run", source=Source("x"))
+    metrics = revisit.evaluate_run(
+        result.folder, truth_mesh=tmp_path / "wall.ply", protocols=["frustum+occlusion+virtual", "frustum"]
+    )
+    by_protocol = metrics["reconstruction_by_protocol"]
+    assert list(by_protocol) == ["frustum+occlusion+virtual", "frustum"]
+    assert all(figures["protocol"] == name for name, figures in by_protocol.items())
+    assert metrics["reconstruction"] == by_protocol["frustum+occlusion+virtual"]
+
+
+def test_evaluate_run_renders_input_views(fake_slam, tmp_path, monkeypatch):
+    """PSNR, SSIM and depth L1 of the frames that were asked for, by the fake's flat grey rendering."""
+    sequence = FakeSequence(8)
+    monkeypatch.setattr(revisit, "open_source", lambda source: sequence)
+    result = pipeline.run(sequence, Config(), tmp_path, source=Source("x"))
+    rendering = revisit.evaluate_run(result.folder, rendered_views=2)["rendering"]
+    assert rendering["frames"] == [0, 7] and rendering["depth_l1_m"] == pytest.approx(0.03, abs=1e-6)
+    grey = np.full((24, 32, 3), 0.2)
+    for name, metric in (("psnr_db", psnr), ("ssim", ssim)):
+        assert rendering[name] == pytest.approx(np.mean([metric(grey, sequence[n].rgb) for n in (0, 7)]), abs=1e-5)
+
+
+def test_extract_mesh_options(fake_slam, tmp_path):
+    """A forecast has a file of its own, the suffix decides, refinement runs first, and a wrong suffix costs no work."""
+    folder = pipeline.run(FakeSequence(2), Config(), tmp_path).folder
+    before = folder.mesh.read_bytes()
+    mesh, path = revisit.extract_mesh(folder, forecast=True)
+    assert path == folder.forecast_mesh and mesh.metadata["forecast_faces"] == 1
+    assert folder.mesh.read_bytes() == before
+    _, path = revisit.extract_mesh(folder, output=tmp_path / "m.glb", refinement_rounds=3)
+    assert path.read_bytes()[:4] == b"glTF" and fake_slam.loaded[-1].refined == 3
+    count = len(fake_slam.loaded)
+    with pytest.raises(MeshError, match="m.obj"):
+        revisit.extract_mesh(folder, output=tmp_path / "m.obj")
+    assert len(fake_slam.loaded) == count
 
 
 def test_progress_reports_each_frame(fake_slam, tmp_path):

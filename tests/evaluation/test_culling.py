@@ -27,6 +27,9 @@ def two_walls() -> trimesh.Trimesh:
 
 
 FRAME = Views(np.eye(4)[None], CAMERA, [np.full((100, 100), 1.0, np.float32)])
+# The same camera, whose image has one pixel that reaches far.
+DEEP = Views(np.eye(4)[None], CAMERA, [np.full((100, 100), 1.0, np.float32)])
+DEEP.depths[0][0, 0] = 3.0
 # A camera between the walls that looks at the second one.
 BETWEEN = Views(np.eye(4)[None].copy(), CAMERA, [np.full((100, 100), 0.5, np.float32)])
 BETWEEN.poses[0, 2, 3] = 1.5
@@ -64,7 +67,7 @@ def test_protocols_by_hand():
     shares = {"frustum": 4 / 5, "frustum+occlusion": 0.0, "frustum+occlusion+virtual": 0.25 / 1.25}
     assert set(shares) == set(PROTOCOLS)
     for protocol, share in shares.items():
-        culling = Culling(protocol, FRAME, BETWEEN)
+        culling = Culling(protocol, DEEP, BETWEEN)
         points, normals = sample_surface(mesh, 20_000, culling=culling)
         assert len(points) == len(normals) == 20_000
         assert (points[:, 2] > 1.5).mean() == pytest.approx(share, abs=0.01), protocol
@@ -72,6 +75,15 @@ def test_protocols_by_hand():
         near = points[points[:, 2] < 1.5]
         assert np.abs(near[:, :2]).max() <= 0.5 + 1e-9
         np.testing.assert_allclose(near[:, :2].mean(axis=0), 0, atol=0.02)
+
+
+def test_virtual_cameras_do_not_reach_beyond_the_frames():
+    """What lies deeper than all that a frame measured, or beside its image, is not asked for by the third protocol."""
+    points = np.array([[0.0, 0.0, 2.0], [0.2, 0.0, 2.0], [1.1, 0.0, 2.0]])
+    wide = Views(BETWEEN.poses, Intrinsics(20, 20, 49.5, 49.5, 100, 100), BETWEEN.depths)
+    deep, shallow = (Culling("frustum+occlusion+virtual", frames, wide) for frames in (DEEP, FRAME))
+    np.testing.assert_array_equal(deep.keeps(points), [True, True, False])
+    np.testing.assert_array_equal(shallow.keeps(points), [False] * 3)
 
 
 def test_a_hidden_room_is_an_error():

@@ -86,7 +86,7 @@ def test_views_of_what_no_frame_saw_are_rejected(frames, targets):
     culling = Culling("frustum+occlusion", forward)
     seen = sample_surface(room(), 500, culling=culling)[0]
     result = virtual_depth(room(), room(), seen, culling, view_count=3, device="cpu")
-    assert result.drawn_count > 3 * result.view_count
+    assert result.drawn_count > result.view_count
     assert result.view_count == 0 or result.l1 == pytest.approx(0, abs=1e-6)
     blind = Culling("frustum", Views(frames.poses[:1], FRAME_CAMERA, [np.zeros((90, 120), np.float32)]))
     nothing = virtual_depth(room(), room(), seen, blind, view_count=3, device="cpu")

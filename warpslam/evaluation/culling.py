@@ -2,8 +2,9 @@
 
     frustum                     in the image of some frame, at any distance and also behind other surfaces (Sec. 4.1)
     frustum+occlusion           in the image of some frame, and no farther than 5 cm behind what it measured there
-    frustum+occlusion+virtual   as before, of frames or of virtual cameras in the space that the frames saw to be free,
-                                which look at what the frames saw from other sides; their depth is that of the true mesh
+    frustum+occlusion+virtual   as before; or in the image of some frame, no deeper than the deepest point it measured,
+                                and not hidden from virtual cameras, which stand in the space that the frames saw to be
+                                free and look at what they saw from other sides; their depth is that of the true mesh
 
 Figures of different protocols can't be compared: the first asks for surface that no camera saw, the second leaves out
 whatever was invented behind a surface, the third asks for some of what was hidden. So every figure names its protocol.
@@ -65,27 +66,28 @@ class Culling:
         self.protocol = protocol
         self.frames = frames
         self._occlusion = protocol != "frustum"
-        self._groups = [frames]
-        if protocol.endswith("virtual") and virtual is not None:
-            self._groups.append(virtual)
+        self._virtual = virtual if protocol.endswith("virtual") else None
 
     def keeps(self, points: np.ndarray) -> np.ndarray:
         """Which of the world points (N, 3) [m] count, bool (N,)."""
-        kept = np.zeros(len(points), dtype=bool)
-        for views in self._groups:
+        frames, virtual = self.frames, self._virtual
+        depths = frames.depths if self._occlusion else None
+        kept = visible_points(points, frames.poses, frames.intrinsics, depths)
+        if virtual is not None:
             rest = np.flatnonzero(~kept)
-            depths = views.depths if self._occlusion else None
-            kept[rest] = visible_points(points[rest], views.poses, views.intrinsics, depths)
+            rest = rest[visible_points(points[rest], virtual.poses, virtual.intrinsics, virtual.depths)]
+            # Through a window a virtual camera sees the street: only what the frames were pointed at is asked for.
+            deepest = (np.full(np.shape(depth), np.max(depth)) for depth in frames.depths)
+            kept[rest] = visible_points(points[rest], frames.poses, frames.intrinsics, deepest)
         return kept
 
     def may_keep(self, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
         """Which balls (N, 3), (N,) [m] may hold a point that counts, bool (N,); never wrong about one that does."""
         kept = np.zeros(len(centers), dtype=bool)
-        for views in self._groups:
-            for T_world_camera, depth in zip(views.poses, views.depths, strict=True):
-                rest = np.flatnonzero(~kept)
-                farthest = float(depth.max()) + OCCLUSION_TOLERANCE if self._occlusion else np.inf
-                kept[rest] = _ball_in_frustum(centers[rest], radii[rest], T_world_camera, views.intrinsics, farthest)
+        for T_world_camera, depth in zip(self.frames.poses, self.frames.depths, strict=True):
+            rest = np.flatnonzero(~kept)
+            farthest = float(np.max(depth)) + OCCLUSION_TOLERANCE if self._occlusion else np.inf
+            kept[rest] = _ball_in_frustum(centers[rest], radii[rest], T_world_camera, self.frames.intrinsics, farthest)
         return kept
 
 

@@ -29,11 +29,16 @@ class RenderedFrame(Protocol):
     rendered_depth: [m] (H, W).
     """
 
-    index: int
-    rgb: np.ndarray
-    depth: np.ndarray
-    rendered_rgb: np.ndarray
-    rendered_depth: np.ndarray
+    @property
+    def index(self) -> int: ...  # noqa: D102
+    @property
+    def rgb(self) -> np.ndarray: ...  # noqa: D102
+    @property
+    def depth(self) -> np.ndarray: ...  # noqa: D102
+    @property
+    def rendered_rgb(self) -> np.ndarray: ...  # noqa: D102
+    @property
+    def rendered_depth(self) -> np.ndarray: ...  # noqa: D102
 
 
 def rendering_metrics(frames: Sequence[RenderedFrame]) -> dict[str, Any]:

@@ -242,7 +242,7 @@ def _finished(scene: Field, vertices: np.ndarray, seen: np.ndarray, extra: np.nd
     used = np.unique(faces)
     of_seen = of_seen[used]
     vertices, faces = keep_faces(vertices, faces, np.ones(len(faces), dtype=bool))
-    colors = np.tile(np.uint8(FORECAST_COLOR), (len(vertices), 1))
+    colors = np.tile(np.array(FORECAST_COLOR, dtype=np.uint8), (len(vertices), 1))
     colors[of_seen] = _query_colors(scene, vertices[of_seen])
     return trimesh.Trimesh(
         vertices=vertices,
