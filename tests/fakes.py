@@ -79,6 +79,8 @@ class FakeSlam:
     mesh_fails = False
     compile_seconds = 0.25
     device = "cpu"
+    map_bytes = 2_500_000
+    flops_per_point = 102_598
 
     def __init__(self, intrinsics: Intrinsics, **settings: object) -> None:
         self.settings = settings

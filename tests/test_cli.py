@@ -14,7 +14,7 @@ from warpslam.run_folder import read_json
 
 @pytest.fixture
 def faked(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
-    """Sequences and SLAM that answer at once, behind the real command line; plots are left out."""
+    """Sequences and SLAM that answer at once, behind the real command line; plots and reports are left out."""
 
     class Slam(FakeSlam):
         configs: list = []
@@ -25,6 +25,7 @@ def faked(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
 
     monkeypatch.setattr(pipeline, "build_slam", build)
     monkeypatch.setattr(pipeline._Run, "_draw_plots", lambda self: None)
+    monkeypatch.setattr(pipeline._Run, "_write_report", lambda self: None)
     monkeypatch.setattr(revisit, "load_slam", lambda folder, device=None: Slam.load(folder.map, device))
     monkeypatch.setattr(revisit, "open_source", lambda source: FakeSequence(8, unreadable=(6,)))
     return Slam
@@ -60,6 +61,42 @@ def test_run_records_how_to_open_the_input_again(faked, tmp_path):
     source = read_json(tmp_path / "input.json")
     assert source["path"].startswith("/") and source["path"].endswith("seq")
     assert (source["dataset"], source["camera"]) == ("icl", "1,1,1,1,2,2,1000")
+    assert source["command"] == f"warpslam run seq --dataset icl --camera 1,1,1,1,2,2,1000 -o {tmp_path}"
+
+
+def test_report_of_one_run_and_of_several(faked, tmp_path, monkeypatch, capsys):
+    """One run: its report, in its folder or where it is told to. Several: a comparison."""
+    for name in ("a", "b"):
+        cli.main(["run", "seq", "--frames", "0:3", "-o", str(tmp_path / name)])
+    monkeypatch.setattr("warpslam.report.images.SUPERSAMPLING", 1)
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+    for arguments in (["a"], ["a", "-o", "other.html"], ["a", "b"]):
+        assert cli.main(["report", *arguments]) == 0
+    assert capsys.readouterr().out.split() == ["a/report.html", "other.html", "comparison.html"]
+    assert "<h1>2 runs</h1>" in (tmp_path / "comparison.html").read_text()
+    assert (tmp_path / "a/report.html").read_text() == (tmp_path / "other.html").read_text()
+    assert cli.main(["report", "a", "nowhere"]) == 2
+
+
+def test_method_and_poses_are_passed_on(faked, tmp_path, capsys, monkeypatch):
+    """--method reaches the run; --poses gives an earlier run's trajectory, which is then not tracked again."""
+    assert cli.main(["run", "seq", "--frames", "0:4", "-o", str(tmp_path / "a")]) == 0
+    assert not faked.configs[-1].tracking.use_given_poses
+    assert "map         2.50 MB, 102,598 FLOP a point" in capsys.readouterr().out
+    poses = str(tmp_path / "a" / "trajectory.tum")
+    assert cli.main(["run", "seq", "--frames", "0:4", "--poses", poses, "-o", str(tmp_path / "b")]) == 0
+    assert faked.configs[-1].tracking.use_given_poses
+    assert read_json(tmp_path / "b" / "metrics.json")["poses"] == poses
+    methods = []
+
+    def build(method, intrinsics, config, device, seed):
+        methods.append(method)
+        return faked(intrinsics, config=config)
+
+    monkeypatch.setattr(pipeline, "build_baseline", build)
+    assert cli.main(["run", "seq", "--method", "tsdf", "--frames", "0:4", "-o", str(tmp_path / "c")]) == 0
+    assert methods == ["tsdf"] and read_json(tmp_path / "c" / "metrics.json")["method"] == "tsdf"
 
 
 def test_interrupted_run_exits_130_with_partial_results(faked, tmp_path, monkeypatch):
@@ -77,9 +114,12 @@ def test_interrupted_run_exits_130_with_partial_results(faked, tmp_path, monkeyp
         (["eval", "/no/such/run"], "/no/such/run"),
         (["render", "/no/such/run", "--frame", "0"], "/no/such/run"),
         (["mesh", "/no/such/run"], "/no/such/run"),
+        (["report", "/no/such/run"], "/no/such/run"),
         (["demo", "--set", "mapping.windw=3"], "mapping.windw"),
         (["demo", "--set", "mapping"], "mapping"),
         (["demo", "--device", "cuda:77"], "cuda:77"),
+        (["profile", "demo", "--frames", "0:2", "--device", "cuda:77"], "cuda:77"),
+        (["profile", "demo", "--json", "/no/such/folder/p.json"], "/no/such/folder"),
     ],
 )
 def test_errors_are_one_line_and_exit_2(arguments, message, tmp_path, capsys):
@@ -188,8 +228,19 @@ def test_info_names_versions_devices_and_decoders(capsys, tmp_path):
     random_decoders().save(tmp_path / "d.pth")
     assert cli.main(["info", "--decoders", str(tmp_path / "d.pth")]) == 0
     out = capsys.readouterr().out
-    for word in ("warpslam", "warp-lang", "torch", "cpu", "d.pth", "'coarse': 32", "replica", "tum_rgbd"):
+    words = ["warpslam", "warp-lang", "torch", "cpu", "d.pth", "'coarse': 32", "replica", "tum_rgbd"]
+    words += ["40,961", "443,908"]
+    for word in words:
         assert word in out, word
+
+
+@pytest.mark.parametrize("command", [module.__name__.rpartition(".")[2] for module in cli.COMMANDS])
+def test_each_command_explains_itself(command, capsys):
+    """``--help`` of every command can be formatted, and names its options."""
+    with pytest.raises(SystemExit) as exit_:
+        cli.main([{"evaluate": "eval"}.get(command, command), "--help"])
+    assert exit_.value.code == 0
+    assert "--debug" in capsys.readouterr().out
 
 
 def test_version(capsys):

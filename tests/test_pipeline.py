@@ -16,7 +16,7 @@ from warpslam import pipeline, revisit
 from warpslam.config import Config
 from warpslam.errors import ConfigError, DatasetError, InputError, MeshError
 from warpslam.evaluation import read_tum
-from warpslam.plots import top_view_axes
+from warpslam.plots import load_panels, top_view_axes
 from warpslam.run_folder import RunFolder, Source, read_json, to_json
 
 
@@ -34,6 +34,7 @@ def fake_slam(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
     monkeypatch.setattr(pipeline, "build_slam", build)
     monkeypatch.setattr(pipeline, "load_slam", lambda folder, device=None: Slam.load(folder.map, device))
     monkeypatch.setattr(revisit, "load_slam", lambda folder, device=None: Slam.load(folder.map, device))
+    monkeypatch.setattr("warpslam.report.images.SUPERSAMPLING", 1)
     return Slam
 
 
@@ -48,8 +49,8 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
     assert result.status == "finished"
     assert {file.name for file in folder.path.iterdir()} == {
         "config.yaml", "trajectory.tum", "ground_truth.tum", "mesh.ply", "map.safetensors", "metrics.json",
-        "timing.json", "frames.csv", "input.json", "log.txt", "trajectory_top_view.png",
-        "error_over_time.png", "panels.png",
+        "timing.json", "input.json", "log.txt", "trajectory_top_view.png", "error_over_time.png", "panels.png",
+        "panels.npz", "frames.csv", "frames.json", "report.html",
     }  # fmt: skip
     assert yaml.safe_load(folder.config.read_text())["mapping"]["window"] == Config().mapping.window
     metrics = metrics_of(folder.path)
@@ -62,8 +63,8 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
     assert metrics["rendering"]["depth_l1_m"] == pytest.approx(0.03, abs=1e-6)
     assert metrics["rendering"]["frames"] == [0, 2, 5, 7]
     assert metrics["mesh"]["faces"] == 2
-    assert metrics["seconds"]["kernel_compile"] == 0.25 and metrics["device"] == "cpu"
-    assert metrics["seconds"]["run"] == pytest.approx(metrics["seconds"]["total"] - 0.25)
+    assert metrics["seconds"]["kernel_compile"] >= 0.25 and metrics["device"] == "cpu"
+    assert metrics["seconds"]["run"] == metrics["seconds"]["total"] - metrics["seconds"]["kernel_compile"]
     assert metrics["seconds"]["frames"] > 0
     assert fake_slam.made[-1].finished
     mesh = trimesh.load(folder.mesh)
@@ -75,6 +76,13 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
     assert timing["stages_seconds"]["finish_refinement"] == 0.5
     assert timing["phases"]["mapping"] == {"seconds": 4.0, "calls": 8, "mean_seconds": 0.5}
     assert timing["frames"][2] == {"index": 2, "tracking": 0.25, "mapping": 0.5}
+    frames = read_json(folder.frame_records)
+    assert frames["left_out"] == [] and frames["frames"][2] == {
+        "index": 2, "timestamp": 2 / 30, "status": "OK", "message": "", "inliers": 0.9, "losses": {"loss": 1.5},
+    }  # fmt: skip
+    panels = load_panels(folder.panel_images)
+    assert [panel.index for panel in panels] == [0, 2, 5, 7] and panels[1].rgb[0, 0].tolist() == [42, 42, 42]
+    assert panels[0].rendered_depth[0, 0] == pytest.approx(2.03, abs=1e-3)
     assert "frame 7: OK" in folder.log.read_text()
     for file in folder.path.glob("*.png"):
         assert np.asarray(Image.open(file).convert("L")).std() > 5, f"{file.name} is blank"
@@ -92,6 +100,8 @@ def test_unreadable_frames_are_left_out_and_counted(fake_slam, tmp_path):
     result = pipeline.run(FakeSequence(8, unreadable=(0, 3, 7)), Config(), tmp_path)
     assert result.metrics["frames"]["unreadable"] == 3 and result.metrics["frames"]["processed"] == 5
     assert "frame 3 left out: frame000003.jpg is truncated" in result.folder.log.read_text()
+    left_out = read_json(result.folder.frame_records)["left_out"]
+    assert left_out[1] == {"index": 3, "message": "frame000003.jpg is truncated"}
     np.testing.assert_array_equal(read_tum(result.folder.trajectory)[0], np.array([1, 2, 4, 5, 6]) / 30)
 
 
@@ -286,3 +296,32 @@ def test_missing_pieces_of_a_run_are_named(tmp_path):
         folder.require(folder.map, "the run stopped before it had a map")
     with pytest.raises(MeshError, match="metrics.json"):
         pipeline.load_mesh(folder.metrics)
+
+
+def test_given_poses_replace_those_of_the_sequence(fake_slam, tmp_path):
+    """The method is given the file's poses, nearest in time; frames without one are left out; truth stays truth."""
+    from warpslam.evaluation import write_tum
+
+    given = np.tile(np.eye(4), (3, 1, 1))
+    given[:, 2, 3] = [1.0, 2.0, 3.0]
+    write_tum(tmp_path / "given.tum", np.array([0, 1, 3]) / 30 + 0.001, given)
+    result = pipeline.run(FakeSequence(4), Config(), tmp_path / "run", poses=tmp_path / "given.tum")
+    np.testing.assert_allclose([T[2, 3] for T in fake_slam.made[-1].given], [1.0, 2.0, 3.0])
+    assert result.metrics["frames"]["unreadable"] == 1
+    assert "frame 2 left out" in result.folder.log.read_text()
+    np.testing.assert_allclose(read_tum(result.folder.ground_truth)[1][2], true_pose(3), atol=1e-8)
+    with pytest.raises(DatasetError, match="none.tum"):
+        pipeline.run(FakeSequence(4), Config(), tmp_path / "run", poses=tmp_path / "none.tum")
+
+
+def test_metrics_name_the_method_and_its_map(fake_slam, tmp_path):
+    """Memory and cost of the map are in metrics.json, with the method that made it."""
+    metrics = pipeline.run(FakeSequence(3), Config(), tmp_path).metrics
+    assert metrics["method"] == "nice-slam" and metrics["poses"] is None
+    assert metrics["map"] == {"bytes": 2_500_000, "flops_per_point": 102_598}
+
+
+def test_unknown_method(tmp_path):
+    """The message lists the methods."""
+    with pytest.raises(ConfigError, match="nice-slam, imap, tsdf"):
+        pipeline.run(FakeSequence(3), Config(), tmp_path, method="orb")

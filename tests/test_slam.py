@@ -11,6 +11,7 @@ from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.decoders import load_decoders
 from warpslam.errors import CheckpointError, InputError
+from warpslam.images import read_images
 from warpslam.slam import Slam
 from warpslam.synthetic import SyntheticSequence
 
@@ -184,7 +185,7 @@ def test_arrays_of_any_kind_give_the_same_result(frames):
         (wp.array(frame.rgb, dtype=wp.uint8), wp.array(metres, dtype=float), None),
         (frame.rgb, units, 5000.0),
     ]
-    images = [new_slam()._read_images(*arguments) for arguments in inputs]
+    images = [read_images(rgb, depth, CAMERA, 10.0, scale) for rgb, depth, scale in inputs]
     for rgb, depth in images:
         np.testing.assert_array_equal(rgb, images[0][0])
         np.testing.assert_array_equal(depth, images[0][1])

@@ -1,6 +1,7 @@
-"""Pretrain the decoders on procedural rooms (supplement A.5): `train`, `evaluate`, `export`.
+"""Pretrain the decoders on procedural rooms (supplement A.5): `train`, `quiet`, `evaluate`, `export`.
 
     python tools/pretrain_decoders.py train --out runs/pretraining --minutes 20
+    python tools/pretrain_decoders.py quiet --out runs/quiet --start runs/pretraining/decoders.pth
     python tools/pretrain_decoders.py evaluate --out runs/pretraining --also other=some_decoders.pth
     python tools/pretrain_decoders.py export --out runs/pretraining --to warpslam/data/decoders.pth
 
@@ -11,6 +12,7 @@ continues from checkpoint.pt where there is one. It uses a CUDA device if torch 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import os
 import sys
@@ -24,6 +26,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
 import numpy as np  # noqa: E402
 import torch  # noqa: E402
 from pretraining import evaluation  # noqa: E402
+from pretraining.quiet import quiet_fine_decoder  # noqa: E402
 from pretraining.room_samples import HELD_OUT_SEED, SampleSizes, load_room, prepare_rooms  # noqa: E402
 from pretraining.training import Trainer, TrainingConfig  # noqa: E402
 from rich.console import Console  # noqa: E402
@@ -100,9 +103,22 @@ def evaluate(options: argparse.Namespace) -> int:
     return 0
 
 
+def quiet(options: argparse.Namespace) -> int:
+    """Make the fine decoder silent at zero feature, from decoders in a file; writes decoders.pth."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    report = _logger(options.out / "log.txt")
+    rooms = _rooms(options, range(options.rooms), report)
+    weights = quiet_fine_decoder(load_decoders(options.start), rooms, options.steps, report, seed=options.seed)
+    weights.save(options.out / "decoders.pth")
+    return 0
+
+
 def export(options: argparse.Namespace) -> int:
-    """Copy the trained decoders to a file of tensors alone, and read it back."""
+    """Copy the trained decoders to a file of tensors alone, and read it back; the coarse one from another run if asked.
+    """
     decoders = load_decoders(options.out / "decoders.pth")
+    if options.coarse_from:
+        decoders = dataclasses.replace(decoders, coarse=load_decoders(options.coarse_from).coarse)
     decoders.save(options.to)
     state, again = decoders.state_dict(), load_decoders(options.to).state_dict()
     assert all(np.array_equal(state[name], again[name]) for name in state)
@@ -200,7 +216,14 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--budgets", type=int, nargs="+", default=[10, 30, 60, 120], help="mapping iterations")
     command.add_argument("--seed", type=int, default=0, help="seed of the random decoders")
     command.set_defaults(run=evaluate)
+    command = commands.add_parser("quiet", parents=[shared], help="silence the fine decoder at zero feature")
+    command.add_argument("--start", type=Path, required=True, help="decoders to start from")
+    command.add_argument("--rooms", type=int, default=12, help="training rooms that are mapped for features")
+    command.add_argument("--steps", type=int, default=1600, help="Adam steps")
+    command.add_argument("--seed", type=int, default=0, help="seed of the draws")
+    command.set_defaults(run=quiet)
     command = commands.add_parser("export", parents=[shared], help="write the package's file")
+    command.add_argument("--coarse-from", type=Path, help="take the coarse decoder from this file")
     command.add_argument("--to", type=Path, default=ROOT / "warpslam" / "data" / "decoders.pth")
     command.set_defaults(run=export)
     return parser

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from warpslam.errors import WarpSlamError as WarpSlamError
     from warpslam.evaluation import ate as ate
     from warpslam.evaluation import rpe as rpe
+    from warpslam.profiling import profile as profile
     from warpslam.sequences import open_sequence as open_sequence
     from warpslam.sequences.base import Frame as Frame
     from warpslam.sequences.base import RgbdSequence as RgbdSequence
@@ -57,6 +58,7 @@ _MODULE_OF = {
     "ate": "warpslam.evaluation",
     "load_decoders": "warpslam.decoders",
     "open_sequence": "warpslam.sequences",
+    "profile": "warpslam.profiling",
     "rpe": "warpslam.evaluation",
 }
 

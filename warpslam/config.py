@@ -175,6 +175,44 @@ class MeshingConfig(_Group):
     min_component_area: float = Field(0.2, ge=0, description="smaller loose pieces are dropped [m^2]")
 
 
+class TsdfConfig(_Group):
+    """Baseline: fusion of a truncated signed distance at given poses (``--method tsdf``)."""
+
+    voxel: float = Field(0.02, gt=0, description="edge of a voxel [m]")
+    truncation_voxels: float = Field(4.0, ge=1, le=32, description="distances are cut off at this many voxels")
+    min_weight: int = Field(2, ge=1, description="frames that a voxel must be in to count in meshes and views")
+
+
+class ImapConfig(_Group):
+    """Baseline: iMAP as the authors of NICE-SLAM re-implemented it (``--method imap``).
+
+    Lengths inside the network and its losses are metres times ``scale``. Image borders, sampling along rays, thresholds
+    of a lost track and keyframes are those of the other groups.
+    """
+
+    scale: float = Field(0.1, gt=0, description="network units per metre")
+    importance: int = Field(12, ge=4, le=64, description="samples drawn where the stratified ones found something")
+    empty_samples: int = Field(
+        16, ge=4, le=64, description="samples in front of the surface that should be empty; released code 32"
+    )
+    empty_weight: float = Field(5e-4, ge=0, description="weight of |density| at those samples")
+    tracking_rate: float = Field(
+        5e-4, gt=0, description="learning rate of the pose in the first iteration; tracking.final_rate_factor applies"
+    )
+    tracking_pixels: int = Field(150, ge=16, le=100_000, description="rays per tracking iteration; released code 5000")
+    tracking_iterations: int = Field(12, ge=1, le=10_000, description="iterations per frame; released code 50")
+    mapping_rate: float = Field(
+        1e-3, gt=0, description="learning rate of the network, 0.8 times after every 200 steps; released code 2e-4"
+    )
+    mapping_pixels: int = Field(120, ge=16, le=200_000, description="rays per mapping iteration; released code 5000")
+    first_iterations: int = Field(800, ge=1, description="iterations on the first frame; released code 1500")
+    rounds: int = Field(3, ge=1, description="rounds of a mapping call, each with its own random window")
+    iterations: int = Field(20, ge=1, description="iterations of a round on later frames; released code 100")
+    refinement_rounds: int = Field(5, ge=0, description="rounds of 3 x iterations after the last frame")
+    color_weight: float = Field(0.05, ge=0, description="weight of colour against depth in mapping")
+    level_set: float = Field(10.0, gt=0, description="density of the surface in meshes")
+
+
 class Config(_Group):
     """All settings of a run."""
 
@@ -189,6 +227,8 @@ class Config(_Group):
         description="strict: mapping after tracking, runs repeat to the bit; overlapped: beside it, and the map is at "
         "most one mapping interval behind",
     )
+    imap: ImapConfig = Field(default_factory=ImapConfig)
+    tsdf: TsdfConfig = Field(default_factory=TsdfConfig)
     decoders: str | None = Field(None, description="decoder checkpoint; the package's own when empty")
 
     @classmethod
@@ -312,6 +352,14 @@ PRESETS: dict[str, dict[str, Any]] = {
         mapping={"every": 1, "pixels": 5000, "window": 10},
         grid=_TUM_GRID,
     ),
+    "paper_imap": {
+        "sampling": {"jitter": False},
+        "tracking": {"final_rate_factor": 1.0},
+        "imap": {
+            "tracking_pixels": 5000, "tracking_iterations": 50, "mapping_pixels": 5000, "mapping_rate": 2e-4,
+            "empty_samples": 32, "first_iterations": 1500, "iterations": 100,
+        },
+    },
     "paper_cofusion": _paper(
         {"rotation_rate_factor": 0.2, "pixels": 200, "iterations": 10}, mapping={"bundle_adjustment_rate": 0.0}
     ),

@@ -292,8 +292,12 @@ class RayBatch:
 
     def bound(self, arrays: FieldArrays, *, use_depth: bool = True) -> None:
         """Exit distances and the rays to keep (a measured surface outside the bound drops its ray)."""
+        self.bound_to(arrays.low, arrays.high, use_depth=use_depth)
+
+    def bound_to(self, low: wp.vec3, high: wp.vec3, *, use_depth: bool = True) -> None:
+        """`bound` for the box between two corners."""
         self.launcher.call(self.max_depth.zero_)
-        inputs = [arrays.low, arrays.high, self.origin, self.direction, self.measured_depth, int(use_depth)]
+        inputs = [low, high, self.origin, self.direction, self.measured_depth, int(use_depth)]
         self.launcher.launch(rays.bound_rays, self.count, [*inputs, self.t_exit, self.keep, self.max_depth])
 
     def place_samples(self, stratified: int, surface: int, *, use_depth: bool = True, jitter: bool = False) -> None:
@@ -375,8 +379,9 @@ class RayBatch:
         self, arrays: FieldArrays, stage: str, first: int, stop: int, sample: int, width: int, thresholds: Thresholds
     ) -> list[Step]:
         """Occupancy logits of some samples of the rays ``first`` to ``stop``."""
-        kernels, dim = self.kernels, (stop - first) * width
-        points = [first, sample, width, 32, self.sample_count, self.origin, self.direction, self.z]
+        kernels, count = self.kernels, (stop - first) * width
+        dim = kernels.thread_count(count)
+        points = [count, first, sample, width, 32, self.sample_count, self.origin, self.direction, self.z]
         points += [self.transmittance, thresholds.min_transmittance]
 
         def grid(level: str) -> list:
@@ -396,18 +401,19 @@ class RayBatch:
         self, arrays: FieldArrays, first: int, stop: int, min_weight: float, want_activations: bool = False
     ) -> Step:
         # Rays that ended early have weights, too: only those that are not kept (transmittance -1) get no colour.
-        inputs = [first, 0, self.sample_count, 32, self.sample_count, self.origin, self.direction, self.z]
+        count = (stop - first) * self.sample_count
+        inputs = [count, first, 0, self.sample_count, 32, self.sample_count, self.origin, self.direction, self.z]
         inputs += [self.transmittance, 0.0, arrays.lattices["color"], arrays.features["color"]]
         inputs += [arrays.decoders["color"].weights, self.bits["color"], int(want_activations), self._activations]
         inputs += [self.weight, min_weight, self.color]
-        return (self.kernels.color_forward, (stop - first) * self.sample_count, inputs)
+        return (self.kernels.color_forward, self.kernels.thread_count(count), inputs)
 
     def _make_room_for_activations(self) -> None:
         size = self.capacity * self.max_samples
         if self._activations.shape[0] < size:
             self._activations = wp.empty((size, 5), dtype=Vec32, device=self.device)
             if self.kernels.sums_weights_apart:
-                self._layer_grad = wp.empty((size, 10), dtype=Vec32, device=self.device)
+                self._layer_grad = wp.empty((size, 14), dtype=Vec32, device=self.device)
 
     def _adjoint(
         self, arrays: FieldArrays, stage: str, gradients: Gradients, thresholds: Thresholds
@@ -439,8 +445,8 @@ class RayBatch:
         last: list[wp.Launch] = []
         if want_weights and stage == "color" and self.kernels.sums_weights_apart:
             chunk, points = 256, self.count * samples
-            inputs = [points, chunk, *self._common(arrays, "color"), self._activations, self.color_grad]
-            inputs += [self._layer_grad, gradients.color_weights]
+            inputs = [points, chunk, samples, self.origin, self.direction, self.z, arrays.decoders["color"].weights]
+            inputs += [self._activations, self.color_grad, self._layer_grad, gradients.color_weights]
             dim = (-(-points // chunk), decoder.COLOR_WEIGHT_ROWS)
             last.append(self.launcher.command(self.kernels.color_weights, dim, inputs))
 
@@ -474,7 +480,8 @@ class RayBatch:
         point_grad: wp.array,
     ) -> Step:
         samples = self.sample_count
-        head, dim = [first * samples, slot], (stop - first) * samples
+        count = (stop - first) * samples
+        head, dim = [count, first * samples, slot], self.kernels.thread_count(count)
         if level == "coarse":
             packed = arrays.decoders["coarse"]
             inputs = [*head, 32, samples, self.origin, self.direction, self.z, arrays.lattices["coarse"]]
@@ -490,10 +497,11 @@ class RayBatch:
     ) -> Step:
         samples = self.sample_count
         buffers = self._no_rows if gradients.color_weights is None else gradients.color_weights
-        inputs = [first * samples, slot, *self._common(arrays, "color"), self.bits["color"], self.color_grad]
+        count = (stop - first) * samples
+        inputs = [count, first * samples, slot, *self._common(arrays, "color"), self.bits["color"], self.color_grad]
         inputs += [*self._grid_gradient(gradients, "color"), int(gradients.points), point_grad]
         inputs += [int(gradients.color_weights is not None), self._activations, buffers, self._layer_grad]
-        return (self.kernels.color_backward, (stop - first) * samples, inputs)
+        return (self.kernels.color_backward, self.kernels.thread_count(count), inputs)
 
     # -- losses --------------------------------------------------------------------------------------------------
 

@@ -8,8 +8,10 @@ import warp as wp
 from warpslam.camera import Intrinsics
 from warpslam.kernels import frustum
 from warpslam.kernels.grid import Lattice
+from warpslam.profiling import phase
 
 
+@phase("frustum selection")
 def select_in_frustum(
     lattice: Lattice,
     shape: tuple[int, int, int],

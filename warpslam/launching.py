@@ -1,4 +1,4 @@
-"""Launching Warp kernels: all CPU cores, launches recorded once and replayed, and when kernels are compiled.
+"""Launching Warp kernels: all CPU cores, launches recorded once and replayed.
 
 Warp runs a CPU kernel on the calling thread and releases the GIL meanwhile. Kernels over rays and their samples
 therefore run in equal slices of the rays, one a thread; those that add up gradients get a buffer (``slot``) for each
@@ -9,7 +9,6 @@ order in every run.
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -18,7 +17,7 @@ from typing import Any
 
 import warp as wp
 
-from warpslam.kernels import adam, compositing, decoder, frustum, gauss_newton, grid, losses, rays
+from warpslam.kernels import decoder
 
 MAX_SLICES = 8
 
@@ -224,17 +223,6 @@ def _run_all(commands: list[wp.Launch]) -> None:
 def decoders_for(device: wp.Device):
     """The decoder kernels built for this kind of device."""
     return decoder.CUDA if device.is_cuda else decoder.CPU
-
-
-def compile_kernels(device: wp.Device) -> float:
-    """Load every kernel module for ``device``, compiling what the kernel cache does not hold; returns the seconds it
-    took.
-    """
-    start = time.perf_counter()
-    names = [module.__name__ for module in (adam, compositing, frustum, gauss_newton, grid, losses, rays)]
-    for name in [*names, f"warpslam.decoder_{'cuda' if device.is_cuda else 'cpu'}"]:
-        wp.get_module(name).load(device)
-    return time.perf_counter() - start
 
 
 def synchronize(device: wp.Device) -> None:

@@ -19,6 +19,7 @@ from warpslam.frustum import select_in_frustum
 from warpslam.keyframes import ImagePool, Keyframe, overlap_fractions
 from warpslam.launching import Launcher
 from warpslam.optimizers import ColorDecoderOptimizer, GridOptimizer, PoseOptimizer
+from warpslam.profiling import phase
 from warpslam.scene import LEVELS, SceneMap
 from warpslam.tracker import ray_seed
 
@@ -199,6 +200,7 @@ class Mapper:
         middle, fine = int(self.config.middle_share * iterations), int(self.config.fine_share * iterations)
         return ["middle" if j <= middle else "fine" if j <= fine else "color" for j in range(iterations)]
 
+    @phase("keyframe selection")
     def _choose_window(
         self, images: ImagePool, vector: np.ndarray, keyframes: list[Keyframe], size: int, rng: np.random.Generator
     ) -> list[Keyframe]:

@@ -36,6 +36,7 @@ from warp.geometry import IsoSurfaceMarchingCubes
 
 from warpslam.camera import Intrinsics, check_transform
 from warpslam.errors import InputError, MeshError
+from warpslam.profiling import phase
 
 UNOBSERVED_LOGIT = -100.0
 # What an observed point farther than the band from every surface holds: free, without asking the field.
@@ -103,6 +104,7 @@ class ObservedView:
         return local @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
 
 
+@phase("meshing")
 def extract_mesh(
     scene: Field,
     views: Sequence[ObservedView],

@@ -5,29 +5,36 @@ from __future__ import annotations
 import csv
 import dataclasses
 import logging
+import os
+import platform
 import sys
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpslam.errors import ConfigError, DatasetError, InputError, MeshError
+from warpslam.errors import ConfigError, DatasetError, InputError, MeshError, WarpSlamError
 from warpslam.evaluation import (
     AteResult,
     ReconstructionResult,
     Statistics,
+    associate,
     ate,
     cull_mesh,
     depth_l1,
     evaluate_reconstruction,
+    read_tum,
     rpe,
     write_tum,
 )
+from warpslam.method import DEFAULT_METHOD, build_method, load_method
 from warpslam.resume import (
     RunProgress,
     RunRequest,
@@ -36,16 +43,19 @@ from warpslam.resume import (
     remove_checkpoints,
     write_checkpoint,
 )
-from warpslam.run_folder import RunFolder, Source, write_json
+from warpslam.run_folder import RunFolder, Source, read_json, write_json
 
 if TYPE_CHECKING:
     import trimesh
 
     from warpslam.camera import Intrinsics
+    from warpslam.compilation import ModuleProgress
     from warpslam.config import Config
+    from warpslam.method import Method
     from warpslam.plots import Panel
     from warpslam.sequences.base import Frame, RgbdSequence
-    from warpslam.slam import FrameResult, Slam, Trajectory
+    from warpslam.slam import FrameResult, Slam
+    from warpslam.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
@@ -97,6 +107,9 @@ def run(
     source: Source | None = None,
     truth_mesh: trimesh.Trimesh | None = None,
     on_frame: Callable[[Progress], None] | None = None,
+    on_module: Callable[[ModuleProgress], None] | None = None,
+    method: str = DEFAULT_METHOD,
+    poses: str | Path | None = None,
     checkpoint_every: int | None = None,
     map_path: str | Path | None = None,
     localize_only: bool = False,
@@ -114,6 +127,10 @@ def run(
         source: How to open ``sequence`` again, for `warpslam render`.
         truth_mesh: True surface in the world frame of the sequence; adds the reconstruction metrics.
         on_frame: Called after each frame.
+        on_module: Called before and after each module of kernels is loaded, or compiled if it never was.
+        method: One of `warpslam.method.METHODS`.
+        poses: Trajectory in the TUM format whose poses are given to the method in place of the sequence's own; frames
+            without one are left out. Errors are against the sequence's own as ever.
         checkpoint_every: Frames between two checkpoints; None for none. The schedule has to be deterministic for a
             resumed run to give the same bytes.
         map_path: Map to start from, a file that `Slam.save` wrote; the first frame is looked for in it.
@@ -123,8 +140,8 @@ def run(
     Raises:
         WarpSlamError: The input or a setting can't be used. metrics.json is written even so.
     """
-    selected = _select(sequence, frames)
-    _check_checkpoint_settings(checkpoint_every, map_path, localize_only)
+    selected = select_frames(sequence, frames)
+    _check_checkpoint_settings(checkpoint_every, map_path, localize_only, method)
     request = RunRequest(
         sequence.name,
         len(sequence),
@@ -136,6 +153,7 @@ def run(
         str(map_path) if map_path is not None else None,
         localize_only,
         dataclasses.asdict(source) if source is not None else None,
+        str(poses) if poses is not None else None,
     )
     if saved is None:
         folder = RunFolder.create(output, sequence.name)
@@ -145,7 +163,10 @@ def run(
         folder = RunFolder(output)
         folder.clear_results()
     with _log_file(folder.log, append=saved is not None):
-        run_ = _Run(sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame)
+        given = None if poses is None else GivenPoses.read(poses)
+        run_ = _Run(
+            sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame, on_module, method, given
+        )
         run_.request, run_.checkpoint_every = request, checkpoint_every
         if saved is not None:
             run_.go_on_from(saved)
@@ -164,15 +185,22 @@ class _Run:
         source: Source | None,
         truth_mesh: trimesh.Trimesh | None,
         on_frame: Callable[[Progress], None] | None,
+        on_module: Callable[[ModuleProgress], None] | None,
+        method: str,
+        given: GivenPoses | None,
     ) -> None:
+        self.method, self.given = method, given
         self.sequence, self.config, self.folder, self.selected = sequence, config, folder, selected
         self.device, self.seed, self.source, self.truth_mesh, self.on_frame = device, seed, source, truth_mesh, on_frame
-        self.slam: Slam | None = None
+        self.on_module = on_module
+        self.modules: list[ModuleProgress] = []
+        self.slam: Method | None = None
         self.status = "finished"
+        self.started = datetime.now().astimezone()
         self.frame_indices: list[int] = []
         self.truth_poses: list[np.ndarray] = []
         self.results: list[FrameResult] = []
-        self.unreadable_count = 0
+        self.left_out: list[dict[str, Any]] = []
         self.seconds: dict[str, float] = defaultdict(float)
         self.request: RunRequest | None = None
         self.checkpoint_every: int | None = None
@@ -191,7 +219,7 @@ class _Run:
         progress, self.saved = saved.progress, saved
         self.position, self.first_index = progress.position, progress.first_index
         self.frame_indices, self.truth_poses = progress.frame_indices, progress.truth_poses
-        self.results, self.unreadable_count = progress.results, progress.unreadable_count
+        self.results, self.left_out = progress.results, progress.left_out
         self.seconds.update(progress.seconds)
         self.digests = progress.digests
         self.resumed_count = len(progress.results)
@@ -212,6 +240,7 @@ class _Run:
                 self._write_frames()
                 self._evaluate_trajectory()
                 self._write_map()
+                self._describe_map()
                 self._write_mesh()
                 self._evaluate_reconstruction()
                 self._draw_plots()
@@ -229,7 +258,9 @@ class _Run:
         finally:
             self.seconds["total"] += time.perf_counter() - self.start
             self._write_timing()
+            self._write_frame_records()
             self._write_metrics()
+            self._write_report()
         return RunResult(self.folder, self.status, self.metrics, self.ate, self.reconstruction)
 
     def _write_input(self) -> None:
@@ -241,6 +272,8 @@ class _Run:
     def _build_slam(self) -> None:
         request = self.request
         with self._clock("setup"):
+            with self._clock("kernel_compile"):
+                self.modules = load_kernels(self.sequence, self.device, self.on_module)
             if self.saved is not None:
                 self.slam = self.saved.slam(self.config)
                 log.info("resumed from %s, after %d frames", self.saved.path, self.position)
@@ -250,7 +283,8 @@ class _Run:
                 )
                 self.first_index = len(self.slam.trajectory.poses)
             else:
-                self.slam = build_slam(self.sequence.intrinsics, self.config, self.device, self.seed)
+                build = build_slam if self.method == DEFAULT_METHOD else partial(build_baseline, self.method)
+                self.slam = build(self.sequence.intrinsics, self.config, self.device, self.seed)
         self.seconds["kernel_compile"] += self.slam.compile_seconds
 
     def _process_frames(self) -> None:
@@ -264,8 +298,11 @@ class _Run:
                     T_world_camera = None
                 self.frame_indices.append(frame.index)
                 self.truth_poses.append(np.full((4, 4), np.nan) if T_world_camera is None else T_world_camera)
-                # The world of a map that was loaded need not be that of the sequence's true poses.
-                given = T_world_camera if self._knows_poses() else None
+                if self.given is not None:
+                    given = self.given.at(frame.timestamp)
+                else:
+                    # The world of a map that was loaded need not be that of the sequence's true poses.
+                    given = T_world_camera if self._knows_poses() else None
                 result = self.slam.step(frame.rgb, frame.depth, timestamp=frame.timestamp, T_world_camera=given)
                 self.results.append(result)
                 level = logging.INFO if result.status == "OK" else logging.WARNING
@@ -283,8 +320,13 @@ class _Run:
                 with self._clock("reading"):
                     frame = self.sequence[index]
             except DatasetError as error:
-                self.unreadable_count += 1
+                self.left_out.append({"index": index, "message": str(error)})
                 log.warning("frame %d left out: %s", index, error)
+                continue
+            if self.given is not None and self.given.at(frame.timestamp) is None:
+                message = f"{self.given.path} has no pose for {frame.timestamp:.3f} s"
+                self.left_out.append({"index": index, "message": message})
+                log.warning("frame %d left out: %s", index, message)
                 continue
             yield frame
 
@@ -315,7 +357,7 @@ class _Run:
             self.frame_indices,
             self.truth_poses,
             self.results,
-            self.unreadable_count,
+            self.left_out,
             seconds,
             self.first_index,
             self.digests,
@@ -330,7 +372,7 @@ class _Run:
         rmse = None
         if np.isfinite(truth).all(axis=(1, 2)).any():
             rmse = ate(self._trajectory()[0].poses[: len(truth)], truth).rmse
-        done = len(self.results) + self.unreadable_count
+        done = len(self.results) + len(self.left_out)
         fps = (len(self.results) - self.resumed_count) / max(elapsed, 1e-9)
         return Progress(done, len(self.selected), result, rmse, fps)
 
@@ -383,7 +425,16 @@ class _Run:
         assert self.slam is not None
         with self._clock("saving"):
             self.slam.save(self.folder.map)
-            self.metrics["memory"] = self.slam.memory()
+        self.metrics["map"] = {"bytes": self.slam.map_bytes, "flops_per_point": self.slam.flops_per_point}
+
+    def _describe_map(self) -> None:
+        from warpslam.inventory import take_inventory
+        from warpslam.slam import Slam
+
+        if isinstance(self.slam, Slam):
+            with self._clock("inventory"):
+                self.metrics.update(take_inventory(self.slam))
+                self.metrics["memory"] = self.slam.memory()
 
     def _write_mesh(self) -> None:
         assert self.slam is not None
@@ -418,7 +469,7 @@ class _Run:
         self.metrics["reconstruction"] = reconstruction_metrics(self.reconstruction)
 
     def _draw_plots(self) -> None:
-        from warpslam.plots import plot_error, plot_panels, plot_top_view
+        from warpslam.plots import plot_error, plot_panels, plot_top_view, save_panels
 
         trajectory, count = self._trajectory()
         poses, status = trajectory.poses[:count], trajectory.status[:count]
@@ -432,6 +483,7 @@ class _Run:
         panels = self._render_panels(poses)
         with self._clock("plotting"):
             plot_panels(self.folder.panels, panels)
+            save_panels(self.folder.panel_images, panels)
         self.metrics["rendering"] = {
             "frames": [panel.index for panel in panels],
             "depth_l1_m": float(np.mean([depth_l1(panel.rendered_depth, panel.depth) for panel in panels])),
@@ -469,6 +521,9 @@ class _Run:
                     for phase, times in phases.items()
                 },
                 "stages_seconds": dict(self.seconds),
+                "kernel_modules": {
+                    module.name: {"seconds": module.seconds, "compiled": module.compiled} for module in self.modules
+                },
                 "frames": [
                     {"index": index, **result.timings}
                     for index, result in zip(self.frame_indices, self.results, strict=False)
@@ -476,21 +531,52 @@ class _Run:
             },
         )
 
+    def _write_frame_records(self) -> None:
+        frames = [
+            {
+                "index": index,
+                "timestamp": result.timestamp,
+                "status": result.status,
+                "message": result.message,
+                "inliers": result.inliers,
+                "losses": result.losses,
+            }
+            for index, result in zip(self.frame_indices, self.results, strict=False)
+        ]
+        write_json(self.folder.frame_records, {"frames": frames, "left_out": self.left_out})
+
+    def _write_report(self) -> None:
+        from warpslam.report import write_report
+
+        try:
+            write_report(self.folder)
+        except WarpSlamError as error:
+            # The run is done and its figures are written; what stands in the way is in the log and on the terminal.
+            log.error("no report: %s", error)
+        except Exception:
+            # Must not take the place of the error that ended the run.
+            if self.status != "failed":
+                raise
+            log.exception("no report")
+
     def _write_metrics(self) -> None:
         from warpslam import __version__
+        from warpslam.versions import package_versions
 
         statuses = Counter(result.status for result in self.results)
         frame_seconds = self.seconds["frames"]
         self.metrics = {
             "warpslam": __version__,
             "sequence": self.sequence.name,
+            "method": self.method,
+            "poses": None if self.given is None else self.given.path,
             "status": self.status,
             "device": str(self.slam.device) if self.slam is not None else self.device,
             "seed": self.seed,
             "frames": {
                 "selected": len(self.selected),
                 "processed": len(self.results),
-                "unreadable": self.unreadable_count,
+                "unreadable": len(self.left_out),
                 **{status: statuses.get(status, 0) for status in ("OK", "LOST", "SKIPPED")},
             },
             "seconds": {
@@ -499,8 +585,13 @@ class _Run:
                 "run": self.seconds["total"] - self.seconds["kernel_compile"],
                 "frames": frame_seconds,
             },
+            "compiled_kernels": sorted(module.name for module in self.modules if module.compiled),
             "fps": len(self.results) / frame_seconds if frame_seconds > 0 else None,
             "peak_memory_mib": _peak_memory_mib(),
+            "started": self.started.isoformat(timespec="seconds"),
+            "versions": {"warpslam": __version__, "python": platform.python_version(), **package_versions()},
+            "platform": platform.platform(),
+            "processors": os.cpu_count(),
             **self.metrics,
         }
         write_json(self.folder.metrics, self.metrics)
@@ -514,17 +605,63 @@ class _Run:
             self.seconds[stage] += time.perf_counter() - start
 
 
-def build_slam(intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Slam:
+def load_kernels(
+    sequence: RgbdSequence, device: str | None, report: Callable[[ModuleProgress], None] | None = None
+) -> list[ModuleProgress]:
+    """Load all kernels that a run over ``sequence`` needs, compiling those that never were; see
+    `warpslam.compilation.compile_kernels`.
+
+    Raises:
+        ConfigError: There is no such device.
+    """
+    import warp as wp
+
+    from warpslam.compilation import compile_kernels
+
+    check_device(device)
+    return compile_kernels(wp.get_device(device), report, getattr(sequence, "warp_modules", ()))
+
+
+@dataclass(frozen=True)
+class GivenPoses:
+    """Poses that a file gives to frames, by time.
+
+    path: File. times: [s], shape (N,). poses: T_world_camera, shape (N, 4, 4).
+    """
+
+    path: Path
+    times: np.ndarray
+    poses: np.ndarray
+
+    @classmethod
+    def read(cls, path: str | Path) -> GivenPoses:
+        """Read a trajectory in the TUM format, such as an earlier run's trajectory.tum.
+
+        Raises:
+            DatasetError: The file can't be read.
+        """
+        return cls(Path(path), *read_tum(path))
+
+    def at(self, timestamp: float) -> np.ndarray | None:
+        """The pose nearest in time, within 20 ms; None if there is none."""
+        position = int(associate(np.array([timestamp]), self.times)[0])
+        return None if position < 0 else self.poses[position]
+
+
+def build_slam(intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Method:
     """The SLAM object of a run.
 
     Raises:
         ConfigError: There is no such device.
         CheckpointError: The decoders can't be loaded.
     """
-    from warpslam.slam import Slam
+    return build_baseline(DEFAULT_METHOD, intrinsics, config, device, seed)
 
-    _check_device(device)
-    return Slam(intrinsics, config=config, device=device, seed=seed)
+
+def build_baseline(method: str, intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Method:
+    """Any method of a run, by name; see `warpslam.method.build_method` for what it raises."""
+    check_device(device)
+    return build_method(method, intrinsics, config, device, seed)
 
 
 def open_map(
@@ -539,7 +676,7 @@ def open_map(
     """
     from warpslam.slam import Slam
 
-    _check_device(device)
+    check_device(device)
     slam = Slam.load(path, device, config=config, localize_only=localize_only)
     if slam.intrinsics != intrinsics:
         raise InputError(f"{path} was made with another camera: {slam.intrinsics}, the sequence has {intrinsics}")
@@ -547,22 +684,25 @@ def open_map(
     return slam
 
 
-def load_slam(folder: RunFolder, device: str | None = None) -> Slam:
-    """The SLAM object as a run left it.
+def load_slam(folder: RunFolder, device: str | None = None) -> Method:
+    """The SLAM object (or the baseline) as a run left it.
 
     Raises:
         ConfigError: There is no such device.
         DatasetError: The run saved no map.
         CheckpointError: The map can't be loaded.
     """
-    from warpslam.slam import Slam
-
     path = folder.require(folder.map, "the run stopped before it had a map")
-    _check_device(device)
-    return Slam.load(path, device=device)
+    check_device(device)
+    return load_method(read_json(folder.metrics).get("method", DEFAULT_METHOD), path, device)
 
 
-def _check_device(device: str | None) -> None:
+def check_device(device: str | None) -> None:
+    """Whether Warp has the device of that name; None is Warp's preferred one.
+
+    Raises:
+        ConfigError: It has not.
+    """
     import warp as wp
 
     names = [str(known) for known in wp.get_devices()]
@@ -578,14 +718,18 @@ def _device_name(device: str | None) -> str:
     return str(wp.get_device(device)) if device is None or device in (*names, "cuda") and names[1:] else str(device)
 
 
-def _check_checkpoint_settings(every: int | None, map_path: str | Path | None, localize_only: bool) -> None:
+def _check_checkpoint_settings(
+    every: int | None, map_path: str | Path | None, localize_only: bool, method: str
+) -> None:
+    if method != DEFAULT_METHOD and (every is not None or map_path is not None):
+        raise ConfigError(f"method {method} has no checkpoints and takes no map: leave out checkpoint_every and map")
     if every is not None and every < 1:
         raise ConfigError(f"checkpoint_every = {every} must be at least 1 frame")
     if localize_only and map_path is None:
         raise ConfigError("localize_only needs a map: name one with map_path (--map)")
 
 
-def render_panel(slam: Slam, frame: Frame, T_world_camera: np.ndarray, stride: int = 1) -> Panel:
+def render_panel(slam: Method, frame: Frame, T_world_camera: np.ndarray, stride: int = 1) -> Panel:
     """A frame beside what the map renders from ``T_world_camera`` (4, 4), every ``stride``-th pixel of both."""
     from warpslam.plots import Panel
 
@@ -687,7 +831,12 @@ def psnr(rendered: np.ndarray, rgb: np.ndarray) -> float:
     return float(-10 * np.log10(max(mean_square, 1e-12)))
 
 
-def _select(sequence: RgbdSequence, frames: slice | None) -> range:
+def select_frames(sequence: RgbdSequence, frames: slice | None) -> range:
+    """Numbers of the frames to use, all by default.
+
+    Raises:
+        ConfigError: The slice selects none, or goes backwards.
+    """
     frames = slice(None) if frames is None else frames
     if frames.step is not None and frames.step < 1:
         raise ConfigError(f"frames: step {frames.step} must be at least 1; SLAM goes forward in time")

@@ -10,6 +10,7 @@ import warp as wp
 from warpslam.camera import Intrinsics, vector_from_pose
 from warpslam.config import SamplingConfig
 from warpslam.field import FieldArrays, RayBatch
+from warpslam.profiling import phase
 
 RAYS_PER_CHUNK = 8192
 FIRST_PASS_SAMPLES = 128
@@ -29,6 +30,7 @@ class RenderedImage:
     variance: np.ndarray
 
 
+@phase("rendering")
 def render_image(
     arrays: FieldArrays,
     camera: Intrinsics,

@@ -38,7 +38,8 @@ class RunRequest:
 
     sequence: Name of the input. frame_count: Frames it has. intrinsics: Its camera, by field. frames: Start, stop and
     step of those used. config: All settings. seed: Of every random choice. device: Where it runs. map: Map it started
-    from. localize_only: Whether that map is left as it is. source: How to open the input, by field.
+    from. localize_only: Whether that map is left as it is. source: How to open the input, by field. poses: File of
+    the poses that were given.
     """
 
     sequence: str
@@ -51,6 +52,7 @@ class RunRequest:
     map: str | None = None
     localize_only: bool = False
     source: dict[str, Any] | None = None
+    poses: str | None = None
 
     def differences(self, other: RunRequest) -> list[str]:
         """What ``other`` asks for that is not the same, one line each."""
@@ -67,15 +69,16 @@ class RunProgress:
     """How far a run has come.
 
     position: Frames of the selection that are done, unreadable ones included. frame_indices, truth_poses (4, 4; NaN
-    where unknown), results: Of each processed frame. unreadable_count: Frames left out. seconds: By stage.
-    first_index: Frames that the map had seen before. digests: SHA-256 of the first and the last frame, by frame number.
+    where unknown), results: Of each processed frame. left_out: Index and message of each unreadable one. seconds: By
+    stage. first_index: Frames that the map had seen before. digests: SHA-256 of the first and the last frame, by frame
+    number.
     """
 
     position: int = 0
     frame_indices: list[int] = field(default_factory=list)
     truth_poses: list[np.ndarray] = field(default_factory=list)
     results: list[FrameResult] = field(default_factory=list)
-    unreadable_count: int = 0
+    left_out: list[dict[str, Any]] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     first_index: int = 0
     digests: dict[int, str] = field(default_factory=dict)
@@ -157,7 +160,7 @@ def write_checkpoint(
         "checkpoint_every": checkpoint_every,
         "position": progress.position,
         "frame_indices": progress.frame_indices,
-        "unreadable_count": progress.unreadable_count,
+        "left_out": progress.left_out,
         "seconds": progress.seconds,
         "first_index": progress.first_index,
         "digests": list(progress.digests.items()),
@@ -229,7 +232,7 @@ def _saved_run(path: str, header: dict[str, Any], arrays: dict[str, np.ndarray])
             frame_indices=[int(index) for index in run["frame_indices"]],
             truth_poses=list(truth.reshape(-1, 4, 4)),
             results=[FrameResult(T_world_camera=pose, **row) for pose, row in zip(poses, run["results"], strict=True)],
-            unreadable_count=int(run["unreadable_count"]),
+            left_out=[{"index": int(one["index"]), "message": str(one["message"])} for one in run["left_out"]],
             seconds={str(name): float(seconds) for name, seconds in run["seconds"].items()},
             first_index=int(run["first_index"]),
             digests={int(index): str(digest) for index, digest in run["digests"]},

@@ -21,13 +21,16 @@ _WRITTEN_FILES = (
     "config.yaml",
     "error_over_time.png",
     "frames.csv",
+    "frames.json",
     "ground_truth.tum",
     "input.json",
     "log.txt",
     "map.safetensors",
     "mesh.ply",
     "metrics.json",
+    "panels.npz",
     "panels.png",
+    "report.html",
     "timing.json",
     "trajectory.tum",
     "trajectory_top_view.png",
@@ -43,19 +46,22 @@ class Source:
     path: Folder of the sequence; None for the built-in demo sequence.
     dataset: Format, as `warpslam.sequences.open_sequence` takes it.
     camera: Camera given by hand, "fx,fy,cx,cy,width,height,depth_scale"; None for the dataset's own.
+    command: Command line that started the run; None if a program did.
     """
 
     path: str | None
     dataset: str = "auto"
     camera: str | None = None
+    command: str | None = None
 
 
 class RunFolder:
     """Paths of one run.
 
-    ``config`` effective settings, ``trajectory`` and ``ground_truth`` in TUM format, ``frames`` (status of each),
-    ``mesh``, ``map`` for later rendering, ``metrics``, ``timing``, ``source`` (how to open the input again), ``log``,
-    and the plots. While a run is under way, ``checkpoint`` and ``previous_checkpoint`` (see `warpslam.resume`).
+    ``config`` effective settings, ``trajectory`` and ``ground_truth`` in TUM format, ``frames`` (status of each) and
+    ``frame_records`` (the same with losses, for the report), ``mesh``, ``map`` for later rendering, ``metrics``,
+    ``timing``, ``source`` (how to open the input again), ``log``, ``report``, the plots, and the images of the panels
+    as arrays. While a run is under way, ``checkpoint`` and ``previous_checkpoint`` (see `warpslam.resume`).
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -70,11 +76,14 @@ class RunFolder:
         self.frames = self.path / "frames.csv"
         self.metrics = self.path / "metrics.json"
         self.timing = self.path / "timing.json"
+        self.frame_records = self.path / "frames.json"
         self.source = self.path / "input.json"
         self.log = self.path / "log.txt"
         self.top_view = self.path / "trajectory_top_view.png"
         self.error_plot = self.path / "error_over_time.png"
         self.panels = self.path / "panels.png"
+        self.panel_images = self.path / "panels.npz"
+        self.report = self.path / "report.html"
 
     @classmethod
     def create(cls, path: str | Path | None, name: str, root: str | Path = "runs") -> RunFolder:
@@ -139,7 +148,7 @@ class RunFolder:
         try:
             return Source(**fields)
         except TypeError as error:
-            raise DatasetError(f"{self.source}: expected the fields path, dataset and camera ({error})") from error
+            raise DatasetError(f"{self.source}: expected path, dataset, camera and command ({error})") from error
 
 
 def write_json(path: Path, value: Any) -> None:

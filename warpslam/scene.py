@@ -15,6 +15,7 @@ from warpslam.kernels import grid as grid_kernels
 from warpslam.kernels.grid import Lattice, Vec32
 from warpslam.launching import slice_count
 from warpslam.memory import free_gigabytes
+from warpslam.profiling import phase
 
 LEVELS = ("coarse", "middle", "fine", "color")
 QUERY_CHUNK = 1 << 16
@@ -149,6 +150,7 @@ class SceneMap:
         """Whether no frame has been mapped yet."""
         return not self.grids["middle"].row_count
 
+    @phase("growth")
     def cover(self, low: np.ndarray, high: np.ndarray) -> bool:
         """Grow the map to hold the box ``low``..``high`` [m] plus the margin; True if it grew.
 

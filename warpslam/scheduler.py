@@ -15,6 +15,7 @@ before the one before it was taken over: at most one is missing from the map tha
 
 from __future__ import annotations
 
+import contextvars
 import logging
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -197,7 +198,8 @@ class _Thread:
 
     def start(self, work: Callable[[], Callable[[], MappingResult]]) -> None:
         self._executor = ThreadPoolExecutor(1, thread_name_prefix=THREAD_NAME)
-        self._future = self._executor.submit(lambda: work()())
+        # The context tells a profile which phase the work belongs to.
+        self._future = self._executor.submit(contextvars.copy_context().run, lambda: work()())
 
     def result(self) -> MappingResult:
         try:

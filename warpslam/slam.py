@@ -11,14 +11,18 @@ import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics, check_transform, pose_from_vector, vector_from_pose
+from warpslam.compilation import compile_kernels
+from warpslam.complexity import field_flops, weight_count
 from warpslam.config import Config
 from warpslam.decoders import Decoders, load_decoders
 from warpslam.errors import InputError
 from warpslam.frustum import measured_extent
+from warpslam.images import read_images
 from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth, check_window_fits
-from warpslam.launching import compile_kernels, synchronize
+from warpslam.launching import synchronize
 from warpslam.mapper import Mapper
 from warpslam.meshing import ObservedView, extract_mesh
+from warpslam.profiling import phase
 from warpslam.relocalization import Localizer, Track
 from warpslam.rendering import RenderedImage, render_image
 from warpslam.scene import SceneMap
@@ -90,7 +94,9 @@ class Slam:
         check_window_fits(intrinsics, self.config.keyframes.max_gigabytes, self.config.mapping.window)
         self.device = wp.get_device(device)
         self.seed = seed
-        self.compile_seconds = compile_kernels(self.device)
+        start = time.perf_counter()
+        compile_kernels(self.device)
+        self.compile_seconds = time.perf_counter() - start
         self.scene = SceneMap(decoders or load_decoders(self.config.decoders), self.config.grid, self.device, seed)
         self.keyframes: list[Keyframe] = []
         self._images = ImagePool(intrinsics, self.device, self.config.keyframes.max_gigabytes)
@@ -135,7 +141,7 @@ class Slam:
         """
         index = len(self._vectors)
         timestamp = index / 30.0 if timestamp is None else float(timestamp)
-        rgb, depth = self._read_images(rgb, depth, depth_scale)
+        rgb, depth = read_images(rgb, depth, self.intrinsics, self.config.grid.max_depth, depth_scale)
         given = None if T_world_camera is None else check_transform(T_world_camera)
         if self.config.tracking.use_given_poses and given is None:
             raise InputError(f"frame {index}: tracking.use_given_poses is on, but step() got no T_world_camera")
@@ -283,6 +289,18 @@ class Slam:
             min_component_area=config.min_component_area,
         )
 
+    @property
+    def map_bytes(self) -> int:
+        """Memory of the grids' features and of the decoders, without optimiser state and images [bytes]."""
+        rows = sum(grid.row_count for grid in self.scene.grids.values())
+        weights = sum(weight_count(decoder.level, decoder.hidden) for decoder in self.scene.decoder_weights)
+        return 4 * (32 * rows + weights)
+
+    @property
+    def flops_per_point(self) -> int:
+        """Operations of the field at a point, forward (see `warpslam.complexity`)."""
+        return field_flops({decoder.level: decoder.hidden for decoder in self.scene.decoder_weights})["field"]
+
     def memory(self) -> dict[str, float | None]:
         """Bytes of the map's state, in all and per observed cubic metre; see `warpslam.memory.memory_report`."""
         from warpslam.memory import memory_report
@@ -337,51 +355,22 @@ class Slam:
         self._append(vector_from_pose(pose), timestamp, "SKIPPED")
         return FrameResult(index, timestamp, pose, "SKIPPED", inliers=0.0, message=message)
 
-    def _read_images(self, rgb: Any, depth: Any, depth_scale: float | None) -> tuple[np.ndarray, np.ndarray]:
-        """uint8 (H, W, 3) and float32 (H, W) [m] with 0 for everything that is no measurement."""
-        rgb, depth = _to_numpy(rgb), _to_numpy(depth)
-        size = (self.intrinsics.height, self.intrinsics.width)
-        if rgb.shape != (*size, 3):
-            raise InputError(f"rgb has shape {rgb.shape}, expected {(*size, 3)} from the intrinsics")
-        if depth.shape != size:
-            raise InputError(f"depth has shape {depth.shape}, expected {size} from the intrinsics")
-        if np.issubdtype(rgb.dtype, np.floating):
-            rgb = np.rint(np.clip(np.nan_to_num(rgb), 0.0, 1.0) * 255.0).astype(np.uint8)
-        elif rgb.dtype != np.uint8:
-            raise InputError(f"rgb has dtype {rgb.dtype}, expected uint8 or float in [0, 1]")
-        if np.issubdtype(depth.dtype, np.integer):
-            if depth_scale is None or not depth_scale > 0:
-                raise InputError(f"depth is {depth.dtype}: pass depth_scale, the units per metre (for example 1000)")
-            depth = depth / np.float32(depth_scale)
-        elif not np.issubdtype(depth.dtype, np.floating):
-            raise InputError(f"depth has dtype {depth.dtype}, expected float [m] or uint16 with depth_scale")
-        depth = depth.astype(np.float32)
-        usable = np.isfinite(depth) & (depth > 0) & (depth <= self.config.grid.max_depth)
-        return rgb, np.where(usable, depth, np.float32(0.0))
-
 
 class _timed:
-    """Adds the wall-clock seconds of a block to ``timings[name]``."""
+    """Adds the wall-clock seconds of a block to ``timings[name]``; the block is a phase for the profiler."""
 
     def __init__(self, timings: dict[str, float], name: str, device: wp.Device) -> None:
         self.timings, self.name, self.device = timings, name, device
+        self.phase = phase(name)
 
     def __enter__(self) -> None:
+        self.phase.__enter__()
         self.start = time.perf_counter()
 
     def __exit__(self, *_: object) -> None:
         synchronize(self.device)
         self.timings[self.name] = self.timings.get(self.name, 0.0) + time.perf_counter() - self.start
-
-
-def _to_numpy(array: Any) -> np.ndarray:
-    if isinstance(array, np.ndarray):
-        return array
-    if isinstance(array, wp.array):
-        return array.numpy()
-    if hasattr(array, "detach"):
-        return array.detach().cpu().numpy()
-    raise InputError(f"expected a NumPy, torch or Warp array, got {type(array).__name__}")
+        self.phase.__exit__()
 
 
 def _check_settings(camera: Intrinsics, config: Config) -> None:

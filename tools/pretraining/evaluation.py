@@ -38,7 +38,9 @@ def fit_room(
         color_l1: Mean absolute error of a rendered colour channel, in [0, 1] units.
         residual_rms: Root mean square of the fine decoder's logit where its feature is zero, middle feature as fitted.
     """
-    fit = _fit(weights, room, iterations, seed, rays, factor, scale, start, device)
+    fit = fit_features(
+        weights, room, iterations, seed, rays=rays, factor=factor, scale=scale, start=start, device=device
+    )
     with torch.no_grad():
         return _measure(*fit, room)
 
@@ -47,7 +49,7 @@ def free_space_feature(weights: Decoders, rooms: list[dict[str, np.ndarray]], it
     """Mean middle feature (32,) of vertices that only samples in front of a surface (by more than 0.3 m) touch."""
     found = []
     for i, room in enumerate(rooms):
-        _, pool, features, _ = _fit(weights, room, iterations, i, 200, 1.0, 1.0, None, "cpu")
+        _, pool, features, _ = fit_features(weights, room, iterations, i)
         rows, weight = pool.stencils["middle"]
         solid = ((pool.z > pool.distance[:, None] - 0.3)[..., None] & (weight > 0)).expand_as(rows)
         free = torch.ones(len(features["middle"]), dtype=torch.bool)
@@ -56,16 +58,17 @@ def free_space_feature(weights: Decoders, rooms: list[dict[str, np.ndarray]], it
     return torch.cat(found).mean(dim=0)
 
 
-def _fit(
+def fit_features(
     weights: Decoders,
     room: dict[str, np.ndarray],
     iterations: int,
-    seed: int,
-    rays: int,
-    factor: float,
-    scale: float,
-    start: torch.Tensor | None,
-    device: str,
+    seed: int = 0,
+    *,
+    rays: int = 200,
+    factor: float = 1.0,
+    scale: float = 1.0,
+    start: torch.Tensor | None = None,
+    device: str = "cpu",
 ) -> tuple[DecoderSet, RayPool, dict[str, torch.Tensor], torch.Tensor]:
     """Decoders, rays, fitted features, and the indices of rays kept for the test."""
     rng = np.random.default_rng([seed, 5])

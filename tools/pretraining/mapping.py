@@ -79,7 +79,8 @@ class RayPool:
         """Place the room at random and take all rays of the cameras (indices).
 
         `scale` multiplies the vertex spacings; with `coarse`, the coarse level and its samples are made instead of the
-        others, which that level's stage does not need.
+        others, which that level's stage does not need. That level has all vertices of the room: features that no ray
+        reaches keep their initial noise, as in a map, and the decoder has to guess from those around.
         """
         rotation, shift = random_placement(rng)
         directions = room["directions"][cameras].reshape(-1, 3)
@@ -92,17 +93,25 @@ class RayPool:
         self.distance = self._tensor(distance[seen])
         self.color = self._tensor(room["ray_colors"][cameras].reshape(-1, 3)[seen])
         noise = torch.Generator().manual_seed(int(rng.integers(2**31)))
-        reach = rng.uniform(1.05, 2.0)
-        self.z = sample_unguided(self.distance, reach) if coarse else sample_distances(self.distance, noise)
+        if coarse:
+            box = torch.stack([self._tensor(placed) for placed in _box_of(room["points"] @ rotation.T + shift)])
+            exits = exit_distances(self.origins, self.directions, box)
+            self.z = sample_unguided(exits, noise)
+        else:
+            self.z = sample_distances(self.distance, noise)
         self.points = self.origins[:, None] + self.directions[:, None] * self.z[..., None]
         self.lattices, self.touched, self.stencils = {}, {}, {}
         flat = self.points.reshape(-1, 3)
+        covered = torch.cat([flat, box]) if coarse else flat
         for level in ("coarse",) if coarse else ("middle", "fine"):
             spacing = SPACING[level] * scale
-            lattice = Lattice.covering(flat.amin(0, keepdim=True), flat.amax(0, keepdim=True), spacing)
+            lattice = Lattice.covering(covered.amin(0, keepdim=True), covered.amax(0, keepdim=True), spacing)
             rows, weights = self._stencil(lattice, flat)
             self.lattices[level] = lattice
-            self.touched[level], compact = torch.unique(rows, return_inverse=True)
+            if coarse:
+                self.touched[level], compact = torch.arange(lattice.row_count, device=device), rows
+            else:
+                self.touched[level], compact = torch.unique(rows, return_inverse=True)
             self.stencils[level] = (compact.view(*self.z.shape, 8), weights.view(*self.z.shape, 8))
 
     def __len__(self) -> int:
@@ -154,10 +163,19 @@ def sample_distances(distance: Tensor, generator: torch.Generator) -> Tensor:
     return torch.cat([stratified, surface], dim=1).sort(dim=1).values
 
 
-def sample_unguided(distance: Tensor, reach: float) -> Tensor:
-    """Sample distances (P, 32) [m] of the coarse stage, which are not told the depth, up to `reach` x the largest."""
-    s = torch.linspace(0, 1, STRATIFIED_COUNT, device=distance.device)
-    return (0.01 + reach * distance.max() * s).expand(len(distance), -1)
+def sample_unguided(exits: Tensor, generator: torch.Generator) -> Tensor:
+    """Sample distances (P, 32) [m] of the coarse stage, which are not told the depth, up to where rays leave the map.
+    """
+    return 0.01 + exits[:, None] * _strata(len(exits), STRATIFIED_COUNT, generator).to(exits)
+
+
+def exit_distances(origins: Tensor, directions: Tensor, box: Tensor) -> Tensor:
+    """Distances (P,) [m] at which rays (P, 3) from inside a box (2, 3) leave it."""
+    return ((box[:, None] - origins) / directions).amax(dim=0).amin(dim=1)
+
+
+def _box_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return points.min(axis=0), points.max(axis=0)
 
 
 def _strata(rays: int, count: int, generator: torch.Generator) -> Tensor:

@@ -51,18 +51,20 @@ class TrainingConfig:
     scene_count: int = 12  # rooms that are mapped in one episode of phase 2
     turn_count: int = 2  # of these, how many take a step at a time
     camera_count: int = 2  # views of each
-    coarse_share: float = 0.0  # of the rooms of an episode, for the coarse level alone: forecasts get worse by it
+    coarse_share: float = 0.0  # of the rooms of an episode, for the coarse level alone; see PRETRAINING.md
     finer_share: float = 0.25  # of the other rooms, with half the vertex spacing
     first_share: float = 0.2  # of the rooms, at the learning rates of a run's first frame
     ray_count: int = 160  # rays of a room in one step
     longest_mapping: int = 40  # iterations of a room in an episode; the shortest has 10
     longest_first: int = 160  # the same at the learning rates of a first frame
+    longest_coarse: int = 500  # the same of the coarse level
     mapping_rate: float = 1e-3  # Adam learning rate of the decoders in phase 2, at its start
     mapping_rate_end: float = 3e-5  # and at its end (cosine)
     label_count: int = 1500  # labelled points of a room in one step
     label_weight: float = 0.3  # of the cross entropy [nats] beside the depth error [m] in phase 2
     coarse_label_weight: float = 2.0  # the same for the coarse level, whose labels reach beyond what is seen
     residual_weight: float = 50.0  # of the squared fine logit where the fine feature is zero
+    quiet_band: float = 0.02  # fine logits there up to this cost nothing
     feature_scale: float = 1.0  # on FEATURE_SCALE
     feature_weight: float = 1e-3  # of the squared features of the encoder, before FEATURE_SCALE
 
@@ -263,13 +265,18 @@ class Trainer:
         return self.decoders.weights()
 
     def _silence(self, points: Tensor, middle: Tensor) -> Tensor:
-        """Mean squared fine logit at zero fine feature, for real middle features and for noise of up to 3 x them."""
+        """Mean square of what the fine logit exceeds the quiet band by where the fine feature is zero.
+
+        For real middle features and for noise of up to 3 x them. The band leaves the decoder free to answer small
+        features: without it, a weight that silences the last points also slows the fine level down.
+        """
         draws = torch.rand(2, len(points), 1, generator=self.generator).to(self.device)
         noise = torch.randn(middle.shape, generator=self.generator).to(self.device)
         noise = middle.detach().std() * (0.3 + 2.7 * draws[0]) * noise
         shifted = middle.detach() + torch.where(draws[1] < 0.5, torch.zeros_like(noise), noise)
         mixed = torch.where(draws[1] < 0.75, shifted, noise)
-        return self.decoders.residual(points, torch.zeros_like(middle), mixed).square().mean()
+        residual = self.decoders.residual(points, torch.zeros_like(middle), mixed)
+        return F.relu(residual.abs() - self.config.quiet_band).square().mean()
 
     def _mapping_step(self, scene: dict[str, Any], stage: str) -> dict[str, float]:
         pool: RayPool = scene["pool"]
@@ -297,22 +304,26 @@ class Trainer:
     def _draw_scene(self) -> dict[str, Any]:
         while True:
             room = self.rooms[self.rng.integers(len(self.rooms))]
-            cameras = self.rng.choice(len(room["origins"]), self.config.camera_count, replace=False)
             coarse = self.rng.random() < self.config.coarse_share
+            most = min(6, len(room["origins"]))
+            camera_count = self.rng.integers(1, most + 1) if coarse else self.config.camera_count
+            cameras = self.rng.choice(len(room["origins"]), camera_count, replace=False)
             scale = 0.5 if not coarse and self.rng.random() < self.config.finer_share else 1.0
             pool = RayPool(room, cameras, self.rng, self.device, scale=scale, coarse=coarse)
-            index = self.rng.integers(0, len(room["points"]), 30_000)
+            # The coarse level is for what lies anywhere in the room; the first half of the points is near surfaces.
+            index = self.rng.integers(len(room["points"]) // 2 if coarse else 0, len(room["points"]), 30_000)
             rotation, shift = pool.rotation.astype(np.float32), pool.shift.astype(np.float32)
             points = torch.as_tensor(room["points"][index] @ rotation.T + shift, device=self.device)
             stencils, known = pool.locate(points)
             if known.sum() >= 500:
                 break
         features = pool.initial_features(self.generator)
-        # The first frame of a run is mapped with five times the learning rates. The coarse level has small ones: at the
-        # plain rate an episode would leave its features where they are. Its iterations are cheap, and a run has many.
+        # The first frame of a run is mapped with five times the learning rates, which is where the coarse level, whose
+        # rates are small, gets most of what it holds. Its iterations are cheap, and a run has many.
         first = not coarse and self.rng.random() < self.config.first_share
         factor = 5.0 if coarse or first else 1.0
-        longest = self.config.longest_first if first else (10 if coarse else 1) * self.config.longest_mapping
+        config = self.config
+        longest = config.longest_coarse if coarse else config.longest_first if first else config.longest_mapping
         return {
             "coarse": coarse,
             "iterations": int(self.rng.integers(10, longest + 1)),

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 
 from warpslam import __version__
-from warpslam.cli import evaluate, info, mesh, render, run
+from warpslam.cli import evaluate, info, mesh, profile, render, report, run, warmup
 from warpslam.cli.common import EXIT_ERROR, EXIT_INTERRUPTED
 from warpslam.errors import WarpSlamError
 
-COMMANDS = (run, evaluate, render, mesh, info)
+COMMANDS = (run, evaluate, report, render, mesh, profile, warmup, info)
 """Modules with a function ``add(commands)``, in the order of ``warpslam --help``."""
 
 
@@ -23,6 +24,7 @@ def entry_point() -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0, 2 after an error in the input, 130 after ctrl-C."""
     options = _parser().parse_args(arguments)
+    options.command_line = shlex.join(["warpslam", *(sys.argv[1:] if arguments is None else arguments)])
     try:
         return options.command(options)
     except WarpSlamError as error:

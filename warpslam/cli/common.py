@@ -23,7 +23,21 @@ def add_command(commands: Any, name: str, function: Callable[[argparse.Namespace
     return parser
 
 
+def add_sequence_options(parser: argparse.ArgumentParser) -> None:
+    """How to read a folder, and which frames and settings to use."""
+    parser.add_argument("--dataset", default="auto", help="format of the folder (default: told from its file names)")
+    parser.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
+    parser.add_argument("--preset", help="settings to start from (default: the dataset's)")
+    parser.add_argument("--frames", type=parse_frames, metavar="A:B:STEP", help="frames to use, as in a Python slice")
+
+
 def add_run_options(parser: argparse.ArgumentParser) -> None:
+    """Options of everything that writes a run folder."""
+    add_slam_options(parser)
+    parser.add_argument("-o", "--output", metavar="DIR", help="run folder (default: runs/NAME/TIME)")
+
+
+def add_slam_options(parser: argparse.ArgumentParser) -> None:
     """Options of everything that runs SLAM."""
     parser.add_argument(
         "--set", dest="overrides", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
@@ -32,7 +46,6 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--decoders", metavar="FILE", help="decoder checkpoint (default: the package's own)")
     parser.add_argument("--device", help="cpu, cuda:0, ... (default: a GPU if there is one)")
     parser.add_argument("--seed", type=int, default=0, help="seed of every random choice (0)")
-    parser.add_argument("-o", "--output", metavar="DIR", help="run folder (default: runs/NAME/TIME)")
 
 
 def parse_frames(text: str) -> slice:

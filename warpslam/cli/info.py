@@ -16,22 +16,22 @@ def add(commands: Any) -> None:
 
 def _info(options: argparse.Namespace) -> int:
     import platform
-    from importlib.metadata import PackageNotFoundError, version
 
     from warpslam import __version__
+    from warpslam.complexity import field_flops, flops_per_point
     from warpslam.config import PRESETS
     from warpslam.decoders import DEFAULT_PATH, load_decoders
     from warpslam.sequences import DATASETS
+    from warpslam.versions import package_versions
 
     print(f"warpslam    {__version__}, Python {platform.python_version()}, {platform.platform()}")
-    for package in ("warp-lang", "torch", "numpy", "trimesh", "opencv-python-headless", "open3d"):
-        try:
-            print(f"{package:11} {version(package)}")
-        except PackageNotFoundError:
-            print(f"{package:11} not installed")
+    for package, version in package_versions().items():
+        print(f"{package:11} {version or 'not installed'}")
     print(f"devices     {', '.join(_device_names())}")
     widths = {weights.level: weights.hidden for weights in load_decoders(options.decoders)}
     print(f"decoders    {options.decoders or DEFAULT_PATH}, hidden width {widths}")
+    flops = ", ".join(f"{level} {count:,}" for level, count in field_flops(widths).items())
+    print(f"FLOP/point  {flops} (middle + fine + colour); iMAP* {flops_per_point('imap'):,}")
     print(f"datasets    {', '.join(DATASETS)}")
     print(f"presets     {', '.join(PRESETS)}")
     return 0

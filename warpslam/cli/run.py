@@ -13,16 +13,18 @@ from warpslam.cli.common import (
     EXIT_INTERRUPTED,
     add_command,
     add_run_options,
+    add_sequence_options,
     duration,
-    parse_frames,
     print_reconstruction,
     quiet_warp,
     warnings_on_stderr,
 )
+from warpslam.method import DEFAULT_METHOD, METHODS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from warpslam.compilation import ModuleProgress
     from warpslam.config import Config
     from warpslam.pipeline import Progress, RunResult
     from warpslam.run_folder import Source
@@ -37,19 +39,25 @@ def add(commands: Any) -> None:
     what = run.add_mutually_exclusive_group(required=True)
     what.add_argument("folder", nargs="?", metavar="FOLDER", help="folder of one sequence")
     what.add_argument("--resume", metavar="RUN", help="go on with a run that was stopped, from its last checkpoint")
-    run.add_argument("--dataset", default="auto", help="format of the folder (default: told from its file names)")
-    run.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
-    run.add_argument("--preset", help="settings to start from (default: the dataset's)")
-    run.add_argument("--frames", type=parse_frames, metavar="A:B:STEP", help="frames to use, as in a Python slice")
+    add_sequence_options(run)
     run.add_argument("--truth-mesh", metavar="FILE", help="true surface, for the reconstruction metrics")
     run.add_argument("--map", metavar="FILE", help="start from the map of another run (its folder, or the file)")
     run.add_argument("--localize", action="store_true", help="with --map: only track the camera, leave the map alone")
+    _add_method_options(run)
     _add_checkpoint_option(run)
     add_run_options(run)
 
     demo = add_command(commands, "demo", _demo, "SLAM in a small rendered room; needs no data")
+    _add_method_options(demo)
     _add_checkpoint_option(demo)
     add_run_options(demo)
+
+
+def _add_method_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--method", choices=METHODS, default=DEFAULT_METHOD, help=f"what runs ({DEFAULT_METHOD})")
+    parser.add_argument(
+        "--poses", metavar="FILE", help="take the poses of this TUM trajectory, such as an earlier run's, as given"
+    )
 
 
 def _add_checkpoint_option(parser: argparse.ArgumentParser) -> None:
@@ -69,7 +77,8 @@ def _run(options: argparse.Namespace) -> int:
     quiet_warp()
     if options.resume is not None:
         return _resume(options)
-    source = Source(str(Path(options.folder).expanduser().resolve()), options.dataset, options.camera)
+    path = str(Path(options.folder).expanduser().resolve())
+    source = Source(path, options.dataset, options.camera, options.command_line)
     sequence = open_source(source)
     map_path = None
     if options.map is not None:
@@ -116,6 +125,7 @@ def _resume(options: argparse.Namespace) -> int:
     options.output = options.resume
     options.device = options.device or request.device
     options.seed = options.seed or request.seed
+    options.poses = options.poses or request.poses
     options.checkpoint_every = options.checkpoint_every or saved.checkpoint_every
     return _execute(
         sequence,
@@ -138,7 +148,7 @@ def _demo(options: argparse.Namespace) -> int:
     quiet_warp()
     config = Config.from_preset(demo.PRESET, [*demo.OVERRIDES, *options.overrides])
     sequence = demo.demo_sequence()
-    return _execute(sequence, config, Source(None), options, truth_mesh=sequence.mesh)
+    return _execute(sequence, config, Source(None, command=options.command_line), options, truth_mesh=sequence.mesh)
 
 
 def _execute(
@@ -148,7 +158,10 @@ def _execute(
 
     if options.decoders:
         config = config.model_copy(update={"decoders": options.decoders})
-    with warnings_on_stderr(), _progress(sequence.name) as on_frame:
+    if options.poses:
+        tracking = config.tracking.model_copy(update={"use_given_poses": True})
+        config = config.model_copy(update={"tracking": tracking})
+    with warnings_on_stderr(), _progress(sequence.name) as (on_frame, on_module):
         result = run(
             sequence,
             config,
@@ -157,6 +170,9 @@ def _execute(
             seed=options.seed,
             source=source,
             on_frame=on_frame,
+            on_module=on_module,
+            method=options.method,
+            poses=options.poses,
             checkpoint_every=options.checkpoint_every,
             **keywords,
         )
@@ -165,11 +181,13 @@ def _execute(
 
 
 @contextmanager
-def _progress(name: str) -> Iterator[Callable[[Progress], None]]:
-    """A progress bar on a terminal, about twenty lines anywhere else."""
+def _progress(name: str) -> Iterator[tuple[Callable[[Progress], None], Callable[[ModuleProgress], None]]]:
+    """What shows frames, and modules that are compiled: a progress bar on a terminal, about twenty lines anywhere
+    else.
+    """
     if not sys.stdout.isatty():
-        print(f"{name}: compiling kernels (once a machine), then mapping the first frame", flush=True)
-        yield _print_line
+        print(f"{name}: loading kernels, then mapping the first frame", flush=True)
+        yield _print_line, _print_module
         return
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
@@ -180,7 +198,7 @@ def _progress(name: str) -> Iterator[Callable[[Progress], None]]:
     )  # fmt: skip
     # rich redirects stdout and stderr while the bar is up, so warnings appear above it.
     with Bar(*columns) as bar:
-        task = bar.add_task(name, total=None, figures="compiling kernels (once), mapping the first frame")
+        task = bar.add_task(name, total=None, figures="loading kernels")
 
         def show(progress: Progress) -> None:
             if progress.done >= progress.total:
@@ -189,7 +207,22 @@ def _progress(name: str) -> Iterator[Callable[[Progress], None]]:
                 figures = _figures(progress)
             bar.update(task, total=progress.total, completed=progress.done, figures=figures)
 
-        yield show
+        def show_module(module: ModuleProgress) -> None:
+            figures = _compiling(module) if module.compiled else "loading kernels"
+            if module.done == module.total:
+                figures = "mapping the first frame"
+            bar.update(task, total=module.total, completed=module.done, figures=figures)
+
+        yield show, show_module
+
+
+def _print_module(module: ModuleProgress) -> None:
+    if module.compiled and module.seconds is None:
+        print(_compiling(module), flush=True)
+
+
+def _compiling(module: ModuleProgress) -> str:
+    return f"compiling {module.name} (once a machine), {module.done} of {module.total} modules ready"
 
 
 def _print_line(progress: Progress) -> None:
@@ -220,6 +253,11 @@ def _print_summary(result: RunResult) -> None:
         unaligned = metrics["ate_m"]["unaligned"]["rmse"]
         print(f"ATE RMSE    {100 * result.ate.rmse:.2f} cm aligned, {100 * unaligned:.2f} cm unaligned")
     mesh = metrics.get("mesh", {})
+    size = metrics.get("map")
+    if size:
+        flops = size["flops_per_point"]
+        cost = f", {flops:,} FLOP a point" if flops is not None else ""
+        print(f"map         {size['bytes'] / 1e6:.2f} MB{cost}")
     if "faces" in mesh:
         print(f"mesh        {mesh['vertices']} vertices, {mesh['faces']} faces")
     if result.reconstruction is not None:

@@ -7,21 +7,22 @@ Middle, fine and colour, with e = sin(p B) in R^93 and the looked-up feature c (
 
 Coarse has no embedding and no V_k:  h = c;  h = relu(W_k h + b_k);  after k = 2: h = [c, h].
 
-One thread a point; a forward launch covers some samples of each ray, and skips rays whose transmittance is spent. A
-weight matrix is stored as rows of `Vec32`, row k holding what input k adds to the 32 outputs, so that a layer is
-``r += x[k] * W[k]`` and vectorises over the outputs; the adjoint uses the same rows of the transposed matrices. The
-forward keeps one bit per ReLU (5 words a point and decoder); the adjoint kernels are written by hand, because the
-generated adjoint replays the forward and costs 4 to 16 times as much. They return
+A thread works on a block of samples, a `Block` of 4 x 32 on the CPU and of 1 x 32 on CUDA. A weight matrix is stored as
+rows of `Vec32`, row k holding what input k adds to the 32 outputs, so that a layer is ``r += x[k] * W[k]``: it
+vectorises over the outputs, and each row that is read serves all samples of the block. The weights of a decoder are
+twice as large as a CPU's first cache; one sample at a time, the kernels wait for them and take 1.7 times as long. The
+adjoint uses the same rows of the transposed matrices.
+
+A forward launch covers some samples of each ray, and leaves out blocks of rays whose transmittance is spent. It keeps
+one bit per ReLU (5 words a sample and decoder); the adjoint kernels are written by hand, because the generated adjoint
+replays the forward and costs 4 to 16 times as much. They return
 
     d_logit -> rows of the grid that are selected (``grid_grad``), the sample position (``point_grad``), and for the
-    colour decoder
-    the weights including B (``weight_grad``).
+    colour decoder the weights including B (``weight_grad``).
 
 As in the released code the middle feature that enters the fine decoder carries no gradient.
 
-The CPU backend wants constant trip counts and four accumulation chains, CUDA rolled loops and one chain:
-`decoder_kernels`
-builds either from this one source.
+The CPU backend wants constant trip counts, CUDA rolled loops: `decoder_kernels` builds either from this one source.
 """
 
 from types import SimpleNamespace
@@ -31,6 +32,7 @@ import warp as wp
 from warpslam.kernels.grid import (
     Lattice,
     Vec32,
+    dot32,
     find_cell,
     interpolate,
     interpolate_adjoint_features,
@@ -98,83 +100,42 @@ def angles(p: wp.vec3, weights: wp.array(dtype=Vec32), chunk: int) -> Vec32:
 
 
 @wp.func
-def sine32(a: Vec32) -> Vec32:
-    e = Vec32()
-    for i in range(32):
-        e[i] = sine_cosine(a[i])[0]
-    return e
-
-
-@wp.func
-def cosine32(a: Vec32) -> Vec32:
-    e = Vec32()
-    for i in range(32):
-        e[i] = sine_cosine(a[i])[1]
-    return e
-
-
-@wp.func
-def sum32(a: Vec32) -> float:
-    s0 = float(0.0)
-    s1 = float(0.0)
-    s2 = float(0.0)
-    s3 = float(0.0)
-    for k in range(8):
-        s0 += a[k]
-        s1 += a[k + 8]
-        s2 += a[k + 16]
-        s3 += a[k + 24]
-    return (s0 + s1) + (s2 + s3)
-
-
-@wp.func
-def relu_bits(a: Vec32) -> wp.uint32:
-    bits = wp.uint32(0)
-    for i in range(32):
-        if a[i] > 0.0:
-            bits |= wp.uint32(1) << wp.uint32(i)
-    return bits
-
-
-@wp.func
-def relu32(a: Vec32) -> Vec32:
-    r = Vec32()
-    for i in range(32):
-        r[i] = wp.max(a[i], 0.0)
-    return r
-
-
-@wp.func
-def keep_bits(a: Vec32, bits: wp.uint32) -> Vec32:
-    r = Vec32()
-    for i in range(32):
-        r[i] = wp.where((bits >> wp.uint32(i)) & wp.uint32(1) == wp.uint32(1), a[i], 0.0)
-    return r
-
-
-@wp.func
-def sample_index(thread: int, first_ray: int, first_sample: int, width: int, sample_count: int) -> int:
-    """Sample of a thread, where a launch covers samples ``first_sample`` to ``first_sample + width`` of some rays."""
-    return (first_ray + thread // width) * sample_count + first_sample + thread % width
+def sample_index(point: int, first_ray: int, first_sample: int, width: int, sample_count: int) -> int:
+    """Sample of a point, where a launch covers samples ``first_sample`` to ``first_sample + width`` of some rays."""
+    return (first_ray + point // width) * sample_count + first_sample + point % width
 
 
 @wp.func
 def sample_point(
-    tid: int,
+    sample: int,
     sample_count: int,
     ray_origin: wp.array(dtype=wp.vec3),
     ray_direction: wp.array(dtype=wp.vec3),
     z: wp.array(dtype=float),
 ) -> wp.vec3:
-    ray = tid // sample_count
-    return ray_origin[ray] + z[tid] * ray_direction[ray]
+    ray = sample // sample_count
+    return ray_origin[ray] + z[sample] * ray_direction[ray]
+
+
+BLOCK_SIZE = {"cpu": 4, "cuda": 1}
+"""Samples of a thread."""
 
 
 def decoder_kernels(target: str) -> SimpleNamespace:
-    """Kernels of all decoders for ``target`` "cpu" or "cuda", in the Warp module ``warpslam.decoder_<target>``."""
-    unrolled = target == "cpu"
+    """Kernels of all decoders for ``target`` "cpu" or "cuda", in the Warp module ``warpslam.decoder_<target>``.
+
+    A launch over N samples has `thread_count(N)` threads and takes N as ``point_count``.
+    """
+    size = BLOCK_SIZE[target]
+    on_cpu = target == "cpu"
     module = f"warpslam.decoder_{target}"
-    wp.get_module(module).options.update({"enable_backward": False, "max_unroll": 4})
+    # Without contraction, clang does not fuse a product and a sum of vectors into one instruction.
+    flags = f"{wp.config.cpu_compiler_flags or ''} -ffp-contract=fast"
+    wp.get_module(module).options.update({"enable_backward": False, "max_unroll": 4, "cpu_compiler_flags": flags})
+    Block = wp.types.matrix(shape=(size, 32), dtype=wp.float32)
+    Positions = wp.types.matrix(shape=(size, 3), dtype=wp.float32)
+    Scalars = wp.types.vector(length=size, dtype=wp.float32)
+    Indices = wp.types.vector(length=size, dtype=wp.int32)
 
     def kernel(f):
         return wp.kernel(f, module=module, name=f.__name__, enable_backward=False)
@@ -182,38 +143,232 @@ def decoder_kernels(target: str) -> SimpleNamespace:
     def func(f):
         return wp.func(f, module=module, name=f.__name__)
 
+    # -- blocks ----------------------------------------------------------------------------------------------------
+
     @func
-    def matvec(r: Vec32, x: Vec32, W: wp.array(dtype=Vec32), row: int, trips: int) -> Vec32:
-        """r + sum_k x[k] W[row + k]."""
-        if wp.static(unrolled):
-            r0 = Vec32(r)
-            r1 = Vec32()
-            r2 = Vec32()
-            r3 = Vec32()
-            for k in range(0, 32, 4):
-                r0 += x[k] * W[row + k]
-                r1 += x[k + 1] * W[row + k + 1]
-                r2 += x[k + 2] * W[row + k + 2]
-                r3 += x[k + 3] * W[row + k + 3]
-            return (r0 + r1) + (r2 + r3)
+    def fill(row: Vec32) -> Block:
+        """The same row for each sample."""
+        r = Block()
+        for p in range(size):
+            r[p] += row
+        return r
+
+    @func
+    def outer(d: Scalars, row: Vec32) -> Block:
+        r = Block()
+        for p in range(size):
+            r[p] += d[p] * row
+        return r
+
+    @func
+    def matvec(r: Block, x: Block, W: wp.array(dtype=Vec32), row: int, trips: int) -> Block:
+        """r + sum_k x[:, k] W[row + k]."""
+        s = Block(r)
+        if wp.static(on_cpu):
+            for k in range(32):
+                w = W[row + k]
+                for p in range(size):
+                    s[p] += x[p, k] * w
         else:
-            s = Vec32(r)
             for k in range(trips):
-                s += x[k] * W[row + k]
-            return s
+                w = W[row + k]
+                for p in range(size):
+                    s[p] += x[p, k] * w
+        return s
 
     @func
-    def add_outer(grad: wp.array2d(dtype=Vec32), slot: int, row: int, x: Vec32, d: Vec32):
-        """grad[row + k] += x[k] d."""
+    def relu(a: Block) -> Block:
+        r = Block()
+        for p in range(size):
+            for i in range(32):
+                r[p, i] = wp.max(a[p, i], 0.0)
+        return r
+
+    @func
+    def store_bits(bits: wp.array2d(dtype=wp.uint32), samples: Indices, layer: int, a: Block):
+        """Which units of a layer are active."""
+        for p in range(size):
+            word = wp.uint32(0)
+            for i in range(32):
+                if a[p, i] > 0.0:
+                    word |= wp.uint32(1) << wp.uint32(i)
+            bits[samples[p], layer] = word
+
+    @func
+    def keep_active(a: Block, bits: wp.array2d(dtype=wp.uint32), samples: Indices, layer: int) -> Block:
+        """Adjoint of the ReLU of a layer."""
+        r = Block()
+        for p in range(size):
+            word = bits[samples[p], layer]
+            for i in range(32):
+                r[p, i] = wp.where((word >> wp.uint32(i)) & wp.uint32(1) == wp.uint32(1), a[p, i], 0.0)
+        return r
+
+    @func
+    def embed(positions: Positions, W: wp.array(dtype=Vec32), chunk: int) -> Block:
+        """32 of the 96 sines of the embedding."""
+        e = Block()
+        for p in range(size):
+            a = angles(wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2]), W, chunk)
+            for i in range(32):
+                e[p, i] = sine_cosine(a[i])[0]
+        return e
+
+    @func
+    def angle_adjoint(
+        positions: Positions,
+        W: wp.array(dtype=Vec32),
+        T: wp.array(dtype=Vec32),
+        chunk: int,
+        a0: Block,
+        a3: Block,
+        trips: int,
+    ) -> Block:
+        """Gradient of the angles p B of a chunk from those of the layers that the embedding enters, 0 and 3."""
+        d = matvec(Block(), a0, T, E0_T + 32 * chunk, trips)
+        d = matvec(d, a3, T, E3_T + 32 * chunk, trips)
+        r = Block()
+        for p in range(size):
+            a = angles(wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2]), W, chunk)
+            for i in range(32):
+                r[p, i] = d[p, i] * sine_cosine(a[i])[1]
+        return r
+
+    @func
+    def output_of(h: Block, row: Vec32) -> Scalars:
+        s = Scalars()
+        for p in range(size):
+            s[p] = dot32(h[p], row)
+        return s
+
+    @func
+    def scaled(d: Scalars, a: Block) -> Block:
+        r = Block()
+        for p in range(size):
+            r[p] += d[p] * a[p]
+        return r
+
+    @func
+    def any_wanted(wanted: Indices) -> bool:
+        result = bool(False)
+        for p in range(size):
+            if wanted[p] != 0:
+                result = True
+        return result
+
+    @func
+    def add_outer(grad: wp.array2d(dtype=Vec32), slot: int, row: int, x: Block, d: Block):
+        """grad[row + k] += sum over the block of x[k] d."""
         for k in range(32):
-            wp.atomic_add(grad, slot, row + k, x[k] * d)
+            total = Vec32()
+            for p in range(size):
+                total += x[p, k] * d[p]
+            grad[slot, row + k] = grad[slot, row + k] + total
 
     @func
-    def output_of(h: Vec32, W: wp.array(dtype=Vec32), row: int) -> float:
-        return sum32(wp.cw_mul(h, W[row]))
+    def add_sum(grad: wp.array2d(dtype=Vec32), slot: int, row: int, d: Block):
+        """grad[row] += sum over the block of d."""
+        total = Vec32()
+        for p in range(size):
+            total += d[p]
+        grad[slot, row] = grad[slot, row] + total
+
+    # -- samples ---------------------------------------------------------------------------------------------------
+
+    @func
+    def block_samples(
+        thread: int, point_count: int, first_ray: int, first_sample: int, width: int, sample_count: int
+    ) -> Indices:
+        """Samples of a thread; at the end of a launch the last one stands in for those that are missing."""
+        samples = Indices()
+        for p in range(size):
+            point = wp.min(size * thread + p, point_count - 1)
+            samples[p] = sample_index(point, first_ray, first_sample, width, sample_count)
+        return samples
+
+    @func
+    def any_lit(
+        samples: Indices, sample_count: int, transmittance: wp.array(dtype=float), min_transmittance: float
+    ) -> bool:
+        lit = bool(False)
+        for p in range(size):
+            if transmittance[samples[p] // sample_count] >= min_transmittance:
+                lit = True
+        return lit
+
+    @func
+    def positions_of(
+        samples: Indices,
+        sample_count: int,
+        ray_origin: wp.array(dtype=wp.vec3),
+        ray_direction: wp.array(dtype=wp.vec3),
+        z: wp.array(dtype=float),
+    ) -> Positions:
+        positions = Positions()
+        for p in range(size):
+            positions[p] = sample_point(samples[p], sample_count, ray_origin, ray_direction, z)
+        return positions
+
+    @func
+    def look_up(positions: Positions, lattice: Lattice, features: wp.array(dtype=Vec32)) -> Block:
+        c = Block()
+        for p in range(size):
+            x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
+            c[p] += interpolate(features, lattice, find_cell(lattice, x))
+        return c
+
+    @func
+    def add_to_grid(
+        grid_grad: wp.array2d(dtype=Vec32),
+        slot: int,
+        selected: wp.array(dtype=wp.uint8),
+        lattice: Lattice,
+        positions: Positions,
+        wanted: Indices,
+        dc: Block,
+    ):
+        for p in range(size):
+            if wanted[p] != 0:
+                x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
+                interpolate_adjoint_features(grid_grad, slot, selected, lattice, find_cell(lattice, x), dc[p])
+
+    @func
+    def add_to_points(
+        point_grad: wp.array(dtype=wp.vec3),
+        samples: Indices,
+        positions: Positions,
+        wanted: Indices,
+        lattice: Lattice,
+        features: wp.array(dtype=Vec32),
+        W: wp.array(dtype=Vec32),
+        T: wp.array(dtype=Vec32),
+        dc: Block,
+        a0: Block,
+        a3: Block,
+        trips: int,
+    ):
+        """Through the lookup and through the embedding."""
+        d = Positions()
+        for p in range(size):
+            x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
+            d[p] = interpolate_adjoint_point(features, lattice, find_cell(lattice, x), dc[p])
+        for chunk in range(3):
+            da = angle_adjoint(positions, W, T, chunk, a0, a3, trips)
+            for p in range(size):
+                d[p] += wp.vec3(
+                    dot32(da[p], W[B + 3 * chunk]),
+                    dot32(da[p], W[B + 3 * chunk + 1]),
+                    dot32(da[p], W[B + 3 * chunk + 2]),
+                )
+        for p in range(size):
+            if wanted[p] != 0:
+                point_grad[samples[p]] = point_grad[samples[p]] + wp.vec3(d[p, 0], d[p, 1], d[p, 2])
+
+    # -- middle and fine -------------------------------------------------------------------------------------------
 
     @kernel
     def middle_forward(
+        point_count: int,
         first_ray: int,
         first_sample: int,
         width: int,
@@ -230,35 +385,44 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         bits: wp.array2d(dtype=wp.uint32),
         logit: wp.array(dtype=float),
     ):
-        tid = sample_index(wp.tid(), first_ray, first_sample, width, sample_count)
-        if transmittance[tid // sample_count] < min_transmittance:
+        samples = block_samples(wp.tid(), point_count, first_ray, first_sample, width, sample_count)
+        if not any_lit(samples, sample_count, transmittance, min_transmittance):
             return
-        p = sample_point(tid, sample_count, ray_origin, ray_direction, z)
-        c = interpolate(features, lattice, find_cell(lattice, p))
-        a0 = Vec32(W[BIAS])
-        a3 = Vec32(W[BIAS + 3])
+        positions = positions_of(samples, sample_count, ray_origin, ray_direction, z)
+        c = look_up(positions, lattice, features)
+        a0 = fill(W[BIAS])
+        a3 = fill(W[BIAS + 3])
         for chunk in range(3):
-            e = sine32(angles(p, W, chunk))
+            e = embed(positions, W, chunk)
             a0 = matvec(a0, e, W, E0 + 32 * chunk, trips)
             a3 = matvec(a3, e, W, E3 + 32 * chunk, trips)
-        bits[tid, 0] = relu_bits(a0)
-        h = relu32(a0) + matvec(W[FC_BIAS], c, W, V, trips)
-        a = matvec(W[BIAS + 1], h, W, W1, trips)
-        bits[tid, 1] = relu_bits(a)
-        h = relu32(a) + matvec(W[FC_BIAS + 1], c, W, V + 32, trips)
-        a = matvec(W[BIAS + 2], h, W, W2, trips)
-        bits[tid, 2] = relu_bits(a)
-        h = relu32(a) + matvec(W[FC_BIAS + 2], c, W, V + 64, trips)
+        store_bits(bits, samples, 0, a0)
+        h = matvec(relu(a0) + fill(W[FC_BIAS]), c, W, V, trips)
+        a = matvec(fill(W[BIAS + 1]), h, W, W1, trips)
+        store_bits(bits, samples, 1, a)
+        h = matvec(relu(a) + fill(W[FC_BIAS + 1]), c, W, V + 32, trips)
+        a = matvec(fill(W[BIAS + 2]), h, W, W2, trips)
+        store_bits(bits, samples, 2, a)
+        h = matvec(relu(a) + fill(W[FC_BIAS + 2]), c, W, V + 64, trips)
         a = matvec(a3, h, W, W3, trips)
-        bits[tid, 3] = relu_bits(a)
-        h = relu32(a) + matvec(W[FC_BIAS + 3], c, W, V + 96, trips)
-        a = matvec(W[BIAS + 4], h, W, W4, trips)
-        bits[tid, 4] = relu_bits(a)
-        h = relu32(a) + matvec(W[FC_BIAS + 4], c, W, V + 128, trips)
-        logit[tid] = output_of(h, W, OUT_32) + W[OUT_32 + 1][0]
+        store_bits(bits, samples, 3, a)
+        h = matvec(relu(a) + fill(W[FC_BIAS + 3]), c, W, V + 96, trips)
+        a = matvec(fill(W[BIAS + 4]), h, W, W4, trips)
+        store_bits(bits, samples, 4, a)
+        h = matvec(relu(a) + fill(W[FC_BIAS + 4]), c, W, V + 128, trips)
+        out = output_of(h, W[OUT_32])
+        for p in range(size):
+            logit[samples[p]] = out[p] + W[OUT_32 + 1][0]
+
+    @func
+    def add_conditions(h: Block, c: Block, m: Block, W: wp.array(dtype=Vec32), layer: int, trips: int) -> Block:
+        """h + V_k [c, m] + d_k of the fine decoder."""
+        r = matvec(h + fill(W[FC_BIAS + layer]), c, W, V + 64 * layer, trips)
+        return matvec(r, m, W, V + 64 * layer + 32, trips)
 
     @kernel
     def fine_forward(
+        point_count: int,
         first_ray: int,
         first_sample: int,
         width: int,
@@ -277,37 +441,44 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         bits: wp.array2d(dtype=wp.uint32),
         logit: wp.array(dtype=float),
     ):
-        tid = sample_index(wp.tid(), first_ray, first_sample, width, sample_count)
-        if transmittance[tid // sample_count] < min_transmittance:
+        samples = block_samples(wp.tid(), point_count, first_ray, first_sample, width, sample_count)
+        if not any_lit(samples, sample_count, transmittance, min_transmittance):
             return
-        p = sample_point(tid, sample_count, ray_origin, ray_direction, z)
-        c = interpolate(features, lattice, find_cell(lattice, p))
-        m = interpolate(middle_features, middle_lattice, find_cell(middle_lattice, p))
-        a0 = Vec32(W[BIAS])
-        a3 = Vec32(W[BIAS + 3])
+        positions = positions_of(samples, sample_count, ray_origin, ray_direction, z)
+        c = look_up(positions, lattice, features)
+        m = look_up(positions, middle_lattice, middle_features)
+        a0 = fill(W[BIAS])
+        a3 = fill(W[BIAS + 3])
         for chunk in range(3):
-            e = sine32(angles(p, W, chunk))
+            e = embed(positions, W, chunk)
             a0 = matvec(a0, e, W, E0 + 32 * chunk, trips)
             a3 = matvec(a3, e, W, E3 + 32 * chunk, trips)
-        bits[tid, 0] = relu_bits(a0)
-        h = relu32(a0) + matvec(matvec(W[FC_BIAS], c, W, V, trips), m, W, V + 32, trips)
-        a = matvec(W[BIAS + 1], h, W, W1, trips)
-        bits[tid, 1] = relu_bits(a)
-        h = relu32(a) + matvec(matvec(W[FC_BIAS + 1], c, W, V + 64, trips), m, W, V + 96, trips)
-        a = matvec(W[BIAS + 2], h, W, W2, trips)
-        bits[tid, 2] = relu_bits(a)
-        h = relu32(a) + matvec(matvec(W[FC_BIAS + 2], c, W, V + 128, trips), m, W, V + 160, trips)
+        store_bits(bits, samples, 0, a0)
+        h = add_conditions(relu(a0), c, m, W, 0, trips)
+        a = matvec(fill(W[BIAS + 1]), h, W, W1, trips)
+        store_bits(bits, samples, 1, a)
+        h = add_conditions(relu(a), c, m, W, 1, trips)
+        a = matvec(fill(W[BIAS + 2]), h, W, W2, trips)
+        store_bits(bits, samples, 2, a)
+        h = add_conditions(relu(a), c, m, W, 2, trips)
         a = matvec(a3, h, W, W3, trips)
-        bits[tid, 3] = relu_bits(a)
-        h = relu32(a) + matvec(matvec(W[FC_BIAS + 3], c, W, V + 192, trips), m, W, V + 224, trips)
-        a = matvec(W[BIAS + 4], h, W, W4, trips)
-        bits[tid, 4] = relu_bits(a)
-        h = relu32(a) + matvec(matvec(W[FC_BIAS + 4], c, W, V + 256, trips), m, W, V + 288, trips)
-        # Eq. 3: the fine level adds a residual to the logit of the middle level.
-        logit[tid] = logit[tid] + output_of(h, W, OUT_64) + W[OUT_64 + 1][0]
+        store_bits(bits, samples, 3, a)
+        h = add_conditions(relu(a), c, m, W, 3, trips)
+        a = matvec(fill(W[BIAS + 4]), h, W, W4, trips)
+        store_bits(bits, samples, 4, a)
+        h = add_conditions(relu(a), c, m, W, 4, trips)
+        out = output_of(h, W[OUT_64])
+        # Eq. 3: the fine level adds a residual to the logit of the middle level. A sample that stands in for a missing
+        # one is the block's last, so that its logit is read before it is written.
+        total = Scalars()
+        for p in range(size):
+            total[p] = logit[samples[p]] + out[p] + W[OUT_64 + 1][0]
+        for p in range(size):
+            logit[samples[p]] = total[p]
 
     @kernel
     def geometry_backward(
+        point_count: int,
         start: int,
         slot: int,
         trips: int,
@@ -330,43 +501,56 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         point_grad: wp.array(dtype=wp.vec3),
     ):
         """Adjoint of `middle_forward` and of `fine_forward` (they differ in ``output_row``)."""
-        tid = start + wp.tid()
-        d = logit_grad[tid]
-        if wp.abs(d) <= min_gradient:
+        first = size * wp.tid()
+        samples = Indices()
+        wanted = Indices()
+        d = Scalars()
+        for p in range(size):
+            samples[p] = start + wp.min(first + p, point_count - 1)
+            if first + p < point_count and wp.abs(logit_grad[samples[p]]) > min_gradient:
+                wanted[p] = 1
+                d[p] = logit_grad[samples[p]]
+        if not any_wanted(wanted):
             return
-        p = sample_point(tid, sample_count, ray_origin, ray_direction, z)
-        g = d * W[output_row]
-        dc = matvec(Vec32(), g, T, V_T + 128, trips)
-        a = keep_bits(g, bits[tid, 4])
-        g = matvec(Vec32(), a, T, W4_T, trips)
+        g = outer(d, W[output_row])
+        dc = matvec(Block(), g, T, V_T + 128, trips)
+        a = keep_active(g, bits, samples, 4)
+        g = matvec(Block(), a, T, W4_T, trips)
         dc = matvec(dc, g, T, V_T + 96, trips)
-        a3 = keep_bits(g, bits[tid, 3])
-        g = matvec(Vec32(), a3, T, W3_T, trips)
+        a3 = keep_active(g, bits, samples, 3)
+        g = matvec(Block(), a3, T, W3_T, trips)
         dc = matvec(dc, g, T, V_T + 64, trips)
-        a = keep_bits(g, bits[tid, 2])
-        g = matvec(Vec32(), a, T, W2_T, trips)
+        a = keep_active(g, bits, samples, 2)
+        g = matvec(Block(), a, T, W2_T, trips)
         dc = matvec(dc, g, T, V_T + 32, trips)
-        a = keep_bits(g, bits[tid, 1])
-        g = matvec(Vec32(), a, T, W1_T, trips)
+        a = keep_active(g, bits, samples, 1)
+        g = matvec(Block(), a, T, W1_T, trips)
         dc = matvec(dc, g, T, V_T, trips)
-        cell = find_cell(lattice, p)
+        positions = positions_of(samples, sample_count, ray_origin, ray_direction, z)
         if want_grid != 0:
-            interpolate_adjoint_features(grid_grad, slot, selected, lattice, cell, dc)
+            add_to_grid(grid_grad, slot, selected, lattice, positions, wanted, dc)
         if want_point != 0:
-            a0 = keep_bits(g, bits[tid, 0])
-            dp = interpolate_adjoint_point(features, lattice, cell, dc)
-            for chunk in range(3):
-                da = matvec(matvec(Vec32(), a0, T, E0_T + 32 * chunk, trips), a3, T, E3_T + 32 * chunk, trips)
-                da = wp.cw_mul(da, cosine32(angles(p, W, chunk)))
-                dp += wp.vec3(
-                    sum32(wp.cw_mul(da, W[B + 3 * chunk])),
-                    sum32(wp.cw_mul(da, W[B + 3 * chunk + 1])),
-                    sum32(wp.cw_mul(da, W[B + 3 * chunk + 2])),
-                )
-            point_grad[tid] = point_grad[tid] + dp
+            a0 = keep_active(g, bits, samples, 0)
+            add_to_points(point_grad, samples, positions, wanted, lattice, features, W, T, dc, a0, a3, trips)
+
+    # -- colour ----------------------------------------------------------------------------------------------------
+
+    @func
+    def store_rows(rows: wp.array2d(dtype=Vec32), samples: Indices, column: int, a: Block, wanted: int):
+        if wanted != 0:
+            for p in range(size):
+                rows[samples[p], column] = a[p]
+
+    @func
+    def load_rows(rows: wp.array2d(dtype=Vec32), samples: Indices, column: int) -> Block:
+        a = Block()
+        for p in range(size):
+            a[p] += rows[samples[p], column]
+        return a
 
     @kernel
     def color_forward(
+        point_count: int,
         first_ray: int,
         first_sample: int,
         width: int,
@@ -387,50 +571,55 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         min_weight: float,
         color: wp.array(dtype=wp.vec3),
     ):
-        tid = sample_index(wp.tid(), first_ray, first_sample, width, sample_count)
-        if transmittance[tid // sample_count] < min_transmittance:
+        samples = block_samples(wp.tid(), point_count, first_ray, first_sample, width, sample_count)
+        if not any_lit(samples, sample_count, transmittance, min_transmittance):
             return
-        if weight[tid] < min_weight:
-            color[tid] = wp.vec3()
+        heavy = Indices()
+        for p in range(size):
+            heavy[p] = wp.where(weight[samples[p]] >= min_weight, 1, 0)
+        if not any_wanted(heavy):
+            for p in range(size):
+                color[samples[p]] = wp.vec3()
             return
-        p = sample_point(tid, sample_count, ray_origin, ray_direction, z)
-        c = interpolate(features, lattice, find_cell(lattice, p))
-        a0 = Vec32(W[BIAS])
-        a3 = Vec32(W[BIAS + 3])
+        positions = positions_of(samples, sample_count, ray_origin, ray_direction, z)
+        c = look_up(positions, lattice, features)
+        a0 = fill(W[BIAS])
+        a3 = fill(W[BIAS + 3])
         for chunk in range(3):
-            e = sine32(angles(p, W, chunk))
+            e = embed(positions, W, chunk)
             a0 = matvec(a0, e, W, E0 + 32 * chunk, trips)
             a3 = matvec(a3, e, W, E3 + 32 * chunk, trips)
-        bits[tid, 0] = relu_bits(a0)
-        h0 = relu32(a0) + matvec(W[FC_BIAS], c, W, V, trips)
-        a = matvec(W[BIAS + 1], h0, W, W1, trips)
-        bits[tid, 1] = relu_bits(a)
-        h1 = relu32(a) + matvec(W[FC_BIAS + 1], c, W, V + 32, trips)
-        a = matvec(W[BIAS + 2], h1, W, W2, trips)
-        bits[tid, 2] = relu_bits(a)
-        h2 = relu32(a) + matvec(W[FC_BIAS + 2], c, W, V + 64, trips)
+        store_bits(bits, samples, 0, a0)
+        h0 = matvec(relu(a0) + fill(W[FC_BIAS]), c, W, V, trips)
+        a = matvec(fill(W[BIAS + 1]), h0, W, W1, trips)
+        store_bits(bits, samples, 1, a)
+        h1 = matvec(relu(a) + fill(W[FC_BIAS + 1]), c, W, V + 32, trips)
+        a = matvec(fill(W[BIAS + 2]), h1, W, W2, trips)
+        store_bits(bits, samples, 2, a)
+        h2 = matvec(relu(a) + fill(W[FC_BIAS + 2]), c, W, V + 64, trips)
         a = matvec(a3, h2, W, W3, trips)
-        bits[tid, 3] = relu_bits(a)
-        h3 = relu32(a) + matvec(W[FC_BIAS + 3], c, W, V + 96, trips)
-        a = matvec(W[BIAS + 4], h3, W, W4, trips)
-        bits[tid, 4] = relu_bits(a)
-        h4 = relu32(a) + matvec(W[FC_BIAS + 4], c, W, V + 128, trips)
-        if want_activations != 0:
-            activations[tid, 0] = h0
-            activations[tid, 1] = h1
-            activations[tid, 2] = h2
-            activations[tid, 3] = h3
-            activations[tid, 4] = h4
-        bias = W[OUT_32 + 3]
+        store_bits(bits, samples, 3, a)
+        h3 = matvec(relu(a) + fill(W[FC_BIAS + 3]), c, W, V + 96, trips)
+        a = matvec(fill(W[BIAS + 4]), h3, W, W4, trips)
+        store_bits(bits, samples, 4, a)
+        h4 = matvec(relu(a) + fill(W[FC_BIAS + 4]), c, W, V + 128, trips)
+        store_rows(activations, samples, 0, h0, want_activations)
+        store_rows(activations, samples, 1, h1, want_activations)
+        store_rows(activations, samples, 2, h2, want_activations)
+        store_rows(activations, samples, 3, h3, want_activations)
+        store_rows(activations, samples, 4, h4, want_activations)
         # Channels 0..2, linear; the released code discards the fourth.
-        color[tid] = wp.vec3(
-            output_of(h4, W, OUT_32) + bias[0],
-            output_of(h4, W, OUT_32 + 1) + bias[1],
-            output_of(h4, W, OUT_32 + 2) + bias[2],
-        )
+        red = output_of(h4, W[OUT_32])
+        green = output_of(h4, W[OUT_32 + 1])
+        blue = output_of(h4, W[OUT_32 + 2])
+        bias = W[OUT_32 + 3]
+        for p in range(size):
+            shown = wp.vec3(red[p] + bias[0], green[p] + bias[1], blue[p] + bias[2])
+            color[samples[p]] = wp.where(heavy[p] != 0, shown, wp.vec3())
 
     @kernel
     def color_backward(
+        point_count: int,
         start: int,
         slot: int,
         trips: int,
@@ -454,98 +643,111 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         weight_grad: wp.array2d(dtype=Vec32),
         layer_grad: wp.array2d(dtype=Vec32),
     ):
-        tid = start + wp.tid()
-        d = color_grad[tid]
-        if d[0] == 0.0 and d[1] == 0.0 and d[2] == 0.0:
+        first = size * wp.tid()
+        samples = Indices()
+        wanted = Indices()
+        red = Scalars()
+        green = Scalars()
+        blue = Scalars()
+        for p in range(size):
+            samples[p] = start + wp.min(first + p, point_count - 1)
+            d = color_grad[samples[p]]
+            if first + p < point_count and (d[0] != 0.0 or d[1] != 0.0 or d[2] != 0.0):
+                wanted[p] = 1
+                red[p] = d[0]
+                green[p] = d[1]
+                blue[p] = d[2]
+        if not any_wanted(wanted):
             return
-        p = sample_point(tid, sample_count, ray_origin, ray_direction, z)
-        g4 = d[0] * W[OUT_32] + d[1] * W[OUT_32 + 1] + d[2] * W[OUT_32 + 2]
-        dc = matvec(Vec32(), g4, T, V_T + 128, trips)
-        a4 = keep_bits(g4, bits[tid, 4])
-        g3 = matvec(Vec32(), a4, T, W4_T, trips)
+        keep = int(0)
+        if wp.static(not on_cpu):
+            # Thousands of threads would queue for the same rows: store, and let `color_weights` sum.
+            keep = want_weights
+        g4 = outer(red, W[OUT_32]) + outer(green, W[OUT_32 + 1]) + outer(blue, W[OUT_32 + 2])
+        store_rows(layer_grad, samples, 9, g4, keep)
+        dc = matvec(Block(), g4, T, V_T + 128, trips)
+        a4 = keep_active(g4, bits, samples, 4)
+        store_rows(layer_grad, samples, 4, a4, keep)
+        g3 = matvec(Block(), a4, T, W4_T, trips)
+        store_rows(layer_grad, samples, 8, g3, keep)
         dc = matvec(dc, g3, T, V_T + 96, trips)
-        a3 = keep_bits(g3, bits[tid, 3])
-        g2 = matvec(Vec32(), a3, T, W3_T, trips)
+        a3 = keep_active(g3, bits, samples, 3)
+        store_rows(layer_grad, samples, 3, a3, keep)
+        g2 = matvec(Block(), a3, T, W3_T, trips)
+        store_rows(layer_grad, samples, 7, g2, keep)
         dc = matvec(dc, g2, T, V_T + 64, trips)
-        a2 = keep_bits(g2, bits[tid, 2])
-        g1 = matvec(Vec32(), a2, T, W2_T, trips)
+        a2 = keep_active(g2, bits, samples, 2)
+        store_rows(layer_grad, samples, 2, a2, keep)
+        g1 = matvec(Block(), a2, T, W2_T, trips)
+        store_rows(layer_grad, samples, 6, g1, keep)
         dc = matvec(dc, g1, T, V_T + 32, trips)
-        a1 = keep_bits(g1, bits[tid, 1])
-        g0 = matvec(Vec32(), a1, T, W1_T, trips)
+        a1 = keep_active(g1, bits, samples, 1)
+        store_rows(layer_grad, samples, 1, a1, keep)
+        g0 = matvec(Block(), a1, T, W1_T, trips)
+        store_rows(layer_grad, samples, 5, g0, keep)
         dc = matvec(dc, g0, T, V_T, trips)
-        a0 = keep_bits(g0, bits[tid, 0])
-        cell = find_cell(lattice, p)
+        a0 = keep_active(g0, bits, samples, 0)
+        store_rows(layer_grad, samples, 0, a0, keep)
+        positions = positions_of(samples, sample_count, ray_origin, ray_direction, z)
         if want_grid != 0:
-            interpolate_adjoint_features(grid_grad, slot, selected, lattice, cell, dc)
+            add_to_grid(grid_grad, slot, selected, lattice, positions, wanted, dc)
         if want_point != 0:
-            dp = interpolate_adjoint_point(features, lattice, cell, dc)
-            for chunk in range(3):
-                da = matvec(matvec(Vec32(), a0, T, E0_T + 32 * chunk, trips), a3, T, E3_T + 32 * chunk, trips)
-                da = wp.cw_mul(da, cosine32(angles(p, W, chunk)))
-                dp += wp.vec3(
-                    sum32(wp.cw_mul(da, W[B + 3 * chunk])),
-                    sum32(wp.cw_mul(da, W[B + 3 * chunk + 1])),
-                    sum32(wp.cw_mul(da, W[B + 3 * chunk + 2])),
-                )
-            point_grad[tid] = point_grad[tid] + dp
+            add_to_points(point_grad, samples, positions, wanted, lattice, features, W, T, dc, a0, a3, trips)
         if want_weights != 0:
-            if wp.static(unrolled):
+            if wp.static(on_cpu):
                 # Each CPU thread owns a buffer that fits its cache: rank-one updates beat storing and multiplying
-                # later.
-                c = interpolate(features, lattice, cell)
-                h4 = activations[tid, 4]
-                wp.atomic_add(weight_grad, slot, OUT_32, d[0] * h4)
-                wp.atomic_add(weight_grad, slot, OUT_32 + 1, d[1] * h4)
-                wp.atomic_add(weight_grad, slot, OUT_32 + 2, d[2] * h4)
+                # later. Samples that are not wanted add zero, whatever activations they have.
+                c = look_up(positions, lattice, features)
+                h4 = load_rows(activations, samples, 4)
+                add_sum(weight_grad, slot, OUT_32, scaled(red, h4))
+                add_sum(weight_grad, slot, OUT_32 + 1, scaled(green, h4))
+                add_sum(weight_grad, slot, OUT_32 + 2, scaled(blue, h4))
                 bias = Vec32()
-                bias[0] = d[0]
-                bias[1] = d[1]
-                bias[2] = d[2]
-                wp.atomic_add(weight_grad, slot, OUT_32 + 3, bias)
-                add_outer(weight_grad, slot, W4, activations[tid, 3], a4)
-                add_outer(weight_grad, slot, W3, activations[tid, 2], a3)
-                add_outer(weight_grad, slot, W2, activations[tid, 1], a2)
-                add_outer(weight_grad, slot, W1, activations[tid, 0], a1)
-                wp.atomic_add(weight_grad, slot, BIAS, a0)
-                wp.atomic_add(weight_grad, slot, BIAS + 1, a1)
-                wp.atomic_add(weight_grad, slot, BIAS + 2, a2)
-                wp.atomic_add(weight_grad, slot, BIAS + 3, a3)
-                wp.atomic_add(weight_grad, slot, BIAS + 4, a4)
-                wp.atomic_add(weight_grad, slot, FC_BIAS, g0)
-                wp.atomic_add(weight_grad, slot, FC_BIAS + 1, g1)
-                wp.atomic_add(weight_grad, slot, FC_BIAS + 2, g2)
-                wp.atomic_add(weight_grad, slot, FC_BIAS + 3, g3)
-                wp.atomic_add(weight_grad, slot, FC_BIAS + 4, g4)
+                for p in range(size):
+                    bias[0] += red[p]
+                    bias[1] += green[p]
+                    bias[2] += blue[p]
+                weight_grad[slot, OUT_32 + 3] = weight_grad[slot, OUT_32 + 3] + bias
+                add_outer(weight_grad, slot, W4, load_rows(activations, samples, 3), a4)
+                add_outer(weight_grad, slot, W3, load_rows(activations, samples, 2), a3)
+                add_outer(weight_grad, slot, W2, load_rows(activations, samples, 1), a2)
+                add_outer(weight_grad, slot, W1, load_rows(activations, samples, 0), a1)
+                add_sum(weight_grad, slot, BIAS, a0)
+                add_sum(weight_grad, slot, BIAS + 1, a1)
+                add_sum(weight_grad, slot, BIAS + 2, a2)
+                add_sum(weight_grad, slot, BIAS + 3, a3)
+                add_sum(weight_grad, slot, BIAS + 4, a4)
+                add_sum(weight_grad, slot, FC_BIAS, g0)
+                add_sum(weight_grad, slot, FC_BIAS + 1, g1)
+                add_sum(weight_grad, slot, FC_BIAS + 2, g2)
+                add_sum(weight_grad, slot, FC_BIAS + 3, g3)
+                add_sum(weight_grad, slot, FC_BIAS + 4, g4)
                 add_outer(weight_grad, slot, V, c, g0)
                 add_outer(weight_grad, slot, V + 32, c, g1)
                 add_outer(weight_grad, slot, V + 64, c, g2)
                 add_outer(weight_grad, slot, V + 96, c, g3)
                 add_outer(weight_grad, slot, V + 128, c, g4)
                 for chunk in range(3):
-                    angle = angles(p, W, chunk)
-                    e = sine32(angle)
+                    e = embed(positions, W, chunk)
                     add_outer(weight_grad, slot, E0 + 32 * chunk, e, a0)
                     add_outer(weight_grad, slot, E3 + 32 * chunk, e, a3)
-                    da = matvec(matvec(Vec32(), a0, T, E0_T + 32 * chunk, trips), a3, T, E3_T + 32 * chunk, trips)
-                    da = wp.cw_mul(da, cosine32(angle))
-                    wp.atomic_add(weight_grad, slot, B + 3 * chunk, p[0] * da)
-                    wp.atomic_add(weight_grad, slot, B + 3 * chunk + 1, p[1] * da)
-                    wp.atomic_add(weight_grad, slot, B + 3 * chunk + 2, p[2] * da)
+                    da = angle_adjoint(positions, W, T, chunk, a0, a3, trips)
+                    for axis in range(3):
+                        coordinate = Scalars()
+                        for p in range(size):
+                            coordinate[p] = positions[p, axis]
+                        add_sum(weight_grad, slot, B + 3 * chunk + axis, scaled(coordinate, da))
             else:
-                # Thousands of threads would queue for the same rows: store, and let `color_weights` sum.
-                layer_grad[tid, 0] = a0
-                layer_grad[tid, 1] = a1
-                layer_grad[tid, 2] = a2
-                layer_grad[tid, 3] = a3
-                layer_grad[tid, 4] = a4
-                layer_grad[tid, 5] = g0
-                layer_grad[tid, 6] = g1
-                layer_grad[tid, 7] = g2
-                layer_grad[tid, 8] = g3
-                layer_grad[tid, 9] = g4
+                store_rows(layer_grad, samples, 13, look_up(positions, lattice, features), keep)
+                for chunk in range(3):
+                    da = angle_adjoint(positions, W, T, chunk, a0, a3, trips)
+                    store_rows(layer_grad, samples, 10 + chunk, da, keep)
+
+    # -- coarse ----------------------------------------------------------------------------------------------------
 
     @kernel
     def coarse_forward(
+        point_count: int,
         first_ray: int,
         first_sample: int,
         width: int,
@@ -562,25 +764,28 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         bits: wp.array2d(dtype=wp.uint32),
         logit: wp.array(dtype=float),
     ):
-        tid = sample_index(wp.tid(), first_ray, first_sample, width, sample_count)
-        if transmittance[tid // sample_count] < min_transmittance:
+        samples = block_samples(wp.tid(), point_count, first_ray, first_sample, width, sample_count)
+        if not any_lit(samples, sample_count, transmittance, min_transmittance):
             return
-        p = sample_point(tid, sample_count, ray_origin, ray_direction, z)
-        c = interpolate(features, lattice, find_cell(lattice, p))
-        h = matvec(W[C_BIAS], c, W, C_W0, trips)
-        bits[tid, 0] = relu_bits(h)
-        h = matvec(W[C_BIAS + 1], relu32(h), W, C_W1, trips)
-        bits[tid, 1] = relu_bits(h)
-        h = matvec(W[C_BIAS + 2], relu32(h), W, C_W2, trips)
-        bits[tid, 2] = relu_bits(h)
-        h = matvec(matvec(W[C_BIAS + 3], c, W, C_C3, trips), relu32(h), W, C_W3, trips)
-        bits[tid, 3] = relu_bits(h)
-        h = matvec(W[C_BIAS + 4], relu32(h), W, C_W4, trips)
-        bits[tid, 4] = relu_bits(h)
-        logit[tid] = output_of(relu32(h), W, C_OUT) + W[C_OUT + 1][0]
+        positions = positions_of(samples, sample_count, ray_origin, ray_direction, z)
+        c = look_up(positions, lattice, features)
+        h = matvec(fill(W[C_BIAS]), c, W, C_W0, trips)
+        store_bits(bits, samples, 0, h)
+        h = matvec(fill(W[C_BIAS + 1]), relu(h), W, C_W1, trips)
+        store_bits(bits, samples, 1, h)
+        h = matvec(fill(W[C_BIAS + 2]), relu(h), W, C_W2, trips)
+        store_bits(bits, samples, 2, h)
+        h = matvec(matvec(fill(W[C_BIAS + 3]), c, W, C_C3, trips), relu(h), W, C_W3, trips)
+        store_bits(bits, samples, 3, h)
+        h = matvec(fill(W[C_BIAS + 4]), relu(h), W, C_W4, trips)
+        store_bits(bits, samples, 4, h)
+        out = output_of(relu(h), W[C_OUT])
+        for p in range(size):
+            logit[samples[p]] = out[p] + W[C_OUT + 1][0]
 
     @kernel
     def coarse_backward(
+        point_count: int,
         start: int,
         slot: int,
         trips: int,
@@ -598,40 +803,44 @@ def decoder_kernels(target: str) -> SimpleNamespace:
     ):
         """Adjoint of `coarse_forward`; the coarse level serves mapping only, so the sample position gets no gradient.
         """
-        tid = start + wp.tid()
-        d = logit_grad[tid]
-        if d == 0.0:
+        first = size * wp.tid()
+        samples = Indices()
+        wanted = Indices()
+        d = Scalars()
+        for p in range(size):
+            samples[p] = start + wp.min(first + p, point_count - 1)
+            if first + p < point_count and logit_grad[samples[p]] != 0.0:
+                wanted[p] = 1
+                d[p] = logit_grad[samples[p]]
+        if not any_wanted(wanted):
             return
-        p = sample_point(tid, sample_count, ray_origin, ray_direction, z)
-        a = keep_bits(d * W[C_OUT], bits[tid, 4])
-        a = keep_bits(matvec(Vec32(), a, T, C_W4, trips), bits[tid, 3])
-        dc = matvec(Vec32(), a, T, C_C3, trips)
-        a = keep_bits(matvec(Vec32(), a, T, C_W3, trips), bits[tid, 2])
-        a = keep_bits(matvec(Vec32(), a, T, C_W2, trips), bits[tid, 1])
-        a = keep_bits(matvec(Vec32(), a, T, C_W1, trips), bits[tid, 0])
+        a = keep_active(outer(d, W[C_OUT]), bits, samples, 4)
+        a = keep_active(matvec(Block(), a, T, C_W4, trips), bits, samples, 3)
+        dc = matvec(Block(), a, T, C_C3, trips)
+        a = keep_active(matvec(Block(), a, T, C_W3, trips), bits, samples, 2)
+        a = keep_active(matvec(Block(), a, T, C_W2, trips), bits, samples, 1)
+        a = keep_active(matvec(Block(), a, T, C_W1, trips), bits, samples, 0)
         dc = matvec(dc, a, T, C_W0, trips)
-        interpolate_adjoint_features(grid_grad, slot, selected, lattice, find_cell(lattice, p), dc)
+        positions = positions_of(samples, sample_count, ray_origin, ray_direction, z)
+        add_to_grid(grid_grad, slot, selected, lattice, positions, wanted, dc)
 
     @kernel
     def color_weights(
         point_count: int,
         chunk_size: int,
-        trips: int,
         sample_count: int,
         ray_origin: wp.array(dtype=wp.vec3),
         ray_direction: wp.array(dtype=wp.vec3),
         z: wp.array(dtype=float),
-        lattice: Lattice,
-        features: wp.array(dtype=Vec32),
         W: wp.array(dtype=Vec32),
-        T: wp.array(dtype=Vec32),
         activations: wp.array2d(dtype=Vec32),
         color_grad: wp.array(dtype=wp.vec3),
         layer_grad: wp.array2d(dtype=Vec32),
         weight_grad: wp.array2d(dtype=Vec32),
     ):
-        """Sum the weight gradient over a chunk of points: x^T d for each layer, one thread a row of the weights
-        (CUDA).
+        """Sum the weight gradient over a chunk of points: x^T d for each layer, one thread a row of the weights (CUDA).
+
+        layer_grad: of a point, as `color_backward` left it: a_0..a_4, g_0..g_4, those of the angles, and the feature.
         """
         block, row = wp.tid()
         first = block * chunk_size
@@ -640,50 +849,36 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         for n in range(first, last):
             d = color_grad[n]
             if d[0] != 0.0 or d[1] != 0.0 or d[2] != 0.0:
+                x = float(1.0)
+                column = int(0)
                 if row < E0:
                     chunk = row // 3
-                    p = sample_point(n, sample_count, ray_origin, ray_direction, z)
-                    da = matvec(
-                        matvec(Vec32(), layer_grad[n, 0], T, E0_T + 32 * chunk, trips),
-                        layer_grad[n, 3],
-                        T,
-                        E3_T + 32 * chunk,
-                        trips,
-                    )
-                    total += p[row - 3 * chunk] * wp.cw_mul(da, cosine32(angles(p, W, chunk)))
+                    x = sample_point(n, sample_count, ray_origin, ray_direction, z)[row - 3 * chunk]
+                    column = 10 + chunk
                 elif row < W1:
                     j = row - E0
-                    layer = int(0)
                     if j >= 96:
                         j -= 96
-                        layer = int(3)
+                        column = 3
                     p = sample_point(n, sample_count, ray_origin, ray_direction, z)
-                    chunk = j // 32
-                    lane = j - 32 * chunk
-                    angle = (
-                        p[0] * W[B + 3 * chunk][lane]
-                        + p[1] * W[B + 3 * chunk + 1][lane]
-                        + p[2] * W[B + 3 * chunk + 2][lane]
-                    )
-                    total += sine_cosine(angle)[0] * layer_grad[n, layer]
+                    x = sine_cosine(angles(p, W, j // 32)[j % 32])[0]
                 elif row < BIAS:
                     layer = (row - W1) // 32
-                    total += activations[n, layer][row - W1 - 32 * layer] * layer_grad[n, layer + 1]
+                    x = activations[n, layer][row - W1 - 32 * layer]
+                    column = layer + 1
                 elif row < V:
-                    total += layer_grad[n, row - BIAS]
+                    column = row - BIAS
                 elif row < OUT_32:
                     layer = (row - V) // 32
-                    p = sample_point(n, sample_count, ray_origin, ray_direction, z)
-                    c = interpolate(features, lattice, find_cell(lattice, p))
-                    total += c[row - V - 32 * layer] * layer_grad[n, 5 + layer]
+                    x = layer_grad[n, 13][row - V - 32 * layer]
+                    column = 5 + layer
+                if row < OUT_32:
+                    total += x * layer_grad[n, column]
                 elif row < OUT_32 + 3:
                     total += d[row - OUT_32] * activations[n, 4]
                 else:
-                    bias = Vec32()
-                    bias[0] = d[0]
-                    bias[1] = d[1]
-                    bias[2] = d[2]
-                    total += bias
+                    for k in range(3):
+                        total[k] += d[k]
         wp.atomic_add(weight_grad, 0, row, total)
 
     @kernel
@@ -716,8 +911,10 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         coarse_backward=coarse_backward,
         color_weights=color_weights,
         transpose_color_weights=transpose_color_weights,
+        # Threads of a launch over so many samples.
+        thread_count=lambda point_count: -(-point_count // size),
         # Whether `color_backward` leaves the sum of the weight gradient to `color_weights`.
-        sums_weights_apart=not unrolled,
+        sums_weights_apart=not on_cpu,
     )
 
 

@@ -13,6 +13,7 @@ import warp as wp
 
 FEATURE_DIM = 32
 Vec32 = wp.types.vector(length=FEATURE_DIM, dtype=wp.float32)
+Vec16 = wp.types.vector(length=FEATURE_DIM // 2, dtype=wp.float32)
 
 
 @wp.struct
@@ -87,18 +88,20 @@ def interpolate(features: wp.array(dtype=Vec32), lattice: Lattice, cell: Cell) -
 
 
 @wp.func
+def sum32(a: Vec32) -> float:
+    # Halves are added to one another: `wp.dot` is one serial chain of 32 additions on the CPU backend.
+    s = Vec16()
+    for i in range(16):
+        s[i] = a[i] + a[i + 16]
+    t = wp.vec4()
+    for i in range(4):
+        t[i] = (s[i] + s[i + 4]) + (s[i + 8] + s[i + 12])
+    return (t[0] + t[2]) + (t[1] + t[3])
+
+
+@wp.func
 def dot32(a: Vec32, b: Vec32) -> float:
-    # A tree sum: `wp.dot` is one serial chain of 32 additions on the CPU backend.
-    s0 = float(0.0)
-    s1 = float(0.0)
-    s2 = float(0.0)
-    s3 = float(0.0)
-    for k in range(8):
-        s0 += a[k] * b[k]
-        s1 += a[k + 8] * b[k + 8]
-        s2 += a[k + 16] * b[k + 16]
-        s3 += a[k + 24] * b[k + 24]
-    return (s0 + s1) + (s2 + s3)
+    return sum32(wp.cw_mul(a, b))
 
 
 @wp.func
@@ -108,19 +111,21 @@ def interpolate_adjoint_point(features: wp.array(dtype=Vec32), lattice: Lattice,
     j = cell.corner[1]
     k = cell.corner[2]
     f = cell.offset
-    du = wp.vec3()
+    # Derivatives of the features along the axes, then three products with dc instead of one a corner.
+    along_x = Vec32()
+    along_y = Vec32()
+    along_z = Vec32()
     for di in range(2):
         for dj in range(2):
             for dk in range(2):
-                s = dot32(dc, features[row_of(lattice, i + di, j + dj, k + dk)])
+                row = features[row_of(lattice, i + di, j + dj, k + dk)]
                 wx = wp.where(di == 1, f[0], 1.0 - f[0])
                 wy = wp.where(dj == 1, f[1], 1.0 - f[1])
                 wz = wp.where(dk == 1, f[2], 1.0 - f[2])
-                du += s * wp.vec3(
-                    wp.where(di == 1, wy * wz, -wy * wz),
-                    wp.where(dj == 1, wx * wz, -wx * wz),
-                    wp.where(dk == 1, wx * wy, -wx * wy),
-                )
+                along_x += wp.where(di == 1, wy * wz, -wy * wz) * row
+                along_y += wp.where(dj == 1, wx * wz, -wx * wz) * row
+                along_z += wp.where(dk == 1, wx * wy, -wx * wy) * row
+    du = wp.vec3(dot32(dc, along_x), dot32(dc, along_y), dot32(dc, along_z))
     return wp.cw_mul(wp.cw_mul(du, cell.free), lattice.inverse_spacing)
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from warpslam.synthetic.contact_sheet import contact_sheet
+from warpslam.synthetic.export import SEQUENCE_KINDS, make_sequence, write_sequence
+from warpslam.synthetic.gap import GapSequence
+from warpslam.synthetic.moving import MovingObjectSequence
 from warpslam.synthetic.noise import sensor_noise
 from warpslam.synthetic.render import MeshRenderer, load_mesh
 from warpslam.synthetic.rooms import Room, make_room
@@ -10,7 +13,10 @@ from warpslam.synthetic.sequence import RenderedSequence, SyntheticSequence, wri
 from warpslam.synthetic.trajectory import look_at, orbit, room_trajectory
 
 __all__ = [
+    "SEQUENCE_KINDS",
+    "GapSequence",
     "MeshRenderer",
+    "MovingObjectSequence",
     "RenderedSequence",
     "Room",
     "SyntheticSequence",
@@ -18,8 +24,10 @@ __all__ = [
     "load_mesh",
     "look_at",
     "make_room",
+    "make_sequence",
     "orbit",
     "room_trajectory",
     "sensor_noise",
     "write_replica",
+    "write_sequence",
 ]

@@ -24,7 +24,10 @@ class RenderedSequence(RgbdSequence):
     """Views of a mesh along a path, rendered when they are asked for.
 
     noise_seed: None = exact depth, else frame i's depth carries `sensor_noise` that depends on (noise_seed, i) only.
+    warp_modules: Modules of kernels that rendering needs, beside those of SLAM.
     """
+
+    warp_modules = ("warpslam.synthetic.raycast",)
 
     def __init__(self, name: str, renderer: MeshRenderer, poses: np.ndarray, *, noise_seed: int | None = None) -> None:
         self.name = name
@@ -43,7 +46,11 @@ class RenderedSequence(RgbdSequence):
         rgb, depth = self._renderer.render(self._poses[index])
         if self.noise_seed is not None:
             depth = sensor_noise(depth, np.random.default_rng((self.noise_seed, index)), self.intrinsics)
-        return Frame(index, index / FRAME_RATE, rgb, depth, self._poses[index].copy())
+        return Frame(index, self.timestamp(index), rgb, depth, self._poses[index].copy())
+
+    def timestamp(self, index: int) -> float:
+        """Time of a frame [s]."""
+        return index / FRAME_RATE
 
     def ground_truth(self) -> np.ndarray:
         """All poses, float64, shape (N, 4, 4)."""

@@ -49,6 +49,7 @@ def orbit(
     aim: float | np.ndarray = 1.2,
     sway: float = 0.03,
     phase: float = 0.0,
+    progress: np.ndarray | None = None,
 ) -> np.ndarray:
     """Walk along an ellipse while looking across it, with the sway of a hand.
 
@@ -60,6 +61,7 @@ def orbit(
         aim: Height of the point above or below the centre that the camera looks at [m], or that point, shape (3,).
         sway: Amplitude of the vertical sway [m].
         phase: Shift of the sway [rad].
+        progress: Frames' worth of walking done at each frame, shape (frame_count,); steady walking if None.
 
     Returns:
         T_world_camera, float64, shape (frame_count, 4, 4), OpenCV axes.
@@ -72,7 +74,7 @@ def orbit(
         target = np.array([center[0], center[1], float(target)])
     poses = np.empty((frame_count, 4, 4))
     for index in range(frame_count):
-        angle = start + turn * index
+        angle = start + turn * (index if progress is None else float(progress[index]))
         # Periods (57, 83, 101 frames) without a common one keep the sway from repeating within a short path.
         bob = [np.sin(2 * np.pi * index / period + phase) for period in (83.0, 57.0, 101.0)]
         eye = center + [radii[0] * np.cos(angle), radii[1] * np.sin(angle), sway * bob[0]]
@@ -81,7 +83,7 @@ def orbit(
     return poses
 
 
-def room_trajectory(room: Room, frame_count: int, seed: int = 0) -> np.ndarray:
+def room_trajectory(room: Room, frame_count: int, seed: int = 0, progress: np.ndarray | None = None) -> np.ndarray:
     """Hand-held-like path inside a room's free space, looking across the room.
 
     The eye moves 1-2 cm (less in a very small room) and turns less than a degree per frame, 1.4-1.6 m above the floor.
@@ -90,6 +92,7 @@ def room_trajectory(room: Room, frame_count: int, seed: int = 0) -> np.ndarray:
         room: Room to walk in.
         frame_count: Number of poses.
         seed: Where the path starts and which way it turns.
+        progress: Frames' worth of walking done at each frame, shape (frame_count,); steady walking if None.
 
     Returns:
         T_world_camera, float64, shape (frame_count, 4, 4), OpenCV axes.
@@ -109,6 +112,7 @@ def room_trajectory(room: Room, frame_count: int, seed: int = 0) -> np.ndarray:
         start=rng.uniform(0, 2 * np.pi),
         aim=float(center[2] - 0.25),
         phase=rng.uniform(0, 2 * np.pi),
+        progress=progress,
     )
 
 

@@ -1,0 +1,415 @@
+"""iMAP (Sucar et al., ICCV 2021) as the authors of NICE-SLAM re-implemented it for comparison, "iMAP*".
+
+One network holds density and colour; there are no feature grids. The frame's pose is tracked against it by Adam; it is
+trained on random pixels of the current frame, the last keyframe and random other keyframes, without bundle adjustment
+and without active sampling. All lengths inside are metres times `ImapConfig.scale`.
+
+Where this differs from the released code: the bound grows with what is seen and is not given; rays whose surface lies
+beyond it are left out; the final pose of a frame is the best of start, last and mean of the second half on one fixed
+set of pixels, not the one with the lowest loss, each on its own pixels; mesh colours are the network's at the vertices,
+not rendered along normals.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+import zipfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warpslam.baselines.base import Baseline
+from warpslam.baselines.imap_network import Bound, ImapBatch, ImapNetwork, Wanted
+from warpslam.camera import Intrinsics, check_transform, pose_from_vector, vector_from_pose
+from warpslam.complexity import flops_per_point, weight_count
+from warpslam.config import Config
+from warpslam.errors import CheckpointError, InputError
+from warpslam.kernels import adam, density, imap, losses, rays
+from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth
+from warpslam.launching import Launcher, Tape, synchronize
+from warpslam.meshing import ObservedView, extract_mesh
+from warpslam.optimizers import PoseOptimizer, RowOptimizer
+from warpslam.rendering import RenderedImage
+from warpslam.slam import FrameResult
+from warpslam.tracker import ray_seed
+
+if TYPE_CHECKING:
+    import trimesh
+
+FORMAT = "warpslam-imap-1"
+TRACKING_COLOR_WEIGHT = 0.5
+DECAY, DECAY_STEPS = 0.8, 200
+# Samples of a rendered view, which has no depth to guide them.
+_VIEW_STRATIFIED, _VIEW_IMPORTANCE = 48, 16
+_VIEW_POINTS = 1 << 14
+_TRACKING, _MAPPING = 21, 22  # purposes of random numbers
+
+
+class Imap(Baseline):
+    """iMAP* under the interface of `warpslam.slam.Slam`. Settings: `ImapConfig` and what that names."""
+
+    name = "imap"
+
+    def __init__(
+        self, intrinsics: Intrinsics, config: Config | None = None, device: str | None = None, seed: int = 0
+    ) -> None:
+        """A random network.
+
+        Args:
+            intrinsics: Camera of all frames.
+            config: Settings, `Config()` by default.
+            device: Warp device, "cpu" or "cuda:0"; by default CUDA where there is one.
+            seed: Of the initial network and of every random choice. Same input, seed and device: same result.
+        """
+        super().__init__(intrinsics, config if config is not None else Config(), seed)
+        self.device = wp.get_device(device)
+        self.compile_seconds = _compile(self.device)
+        self._settings = self.config.imap
+        self._launcher = Launcher(self.device)
+        self.network = ImapNetwork.random(seed, self._launcher)
+        self.keyframes: list[Keyframe] = []
+        self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
+        self._images = ImagePool(intrinsics, self.device, self.config.keyframes.max_gigabytes)
+        self._seen: list[SeenDepth] = []
+        self._mapped: int | None = None
+        self._current: int | None = None
+        settings, stratified = self._settings, self.config.sampling.stratified
+        self._tracking = ImapBatch(settings.tracking_pixels, stratified, settings.importance, 0, self._launcher)
+        self._mapping = ImapBatch(
+            settings.mapping_pixels, stratified, settings.importance, settings.empty_samples, self._launcher
+        )
+        self._poses = PoseOptimizer(1, self._launcher)
+        self._optimizer = RowOptimizer(self._launcher)
+        self._slot_of_frame = wp.zeros(1, dtype=int, device=self.device)
+        self._visited = wp.zeros((settings.tracking_iterations, 7), dtype=float, device=self.device)
+        self._queries: ImapBatch | None = None
+
+    # -- the algorithm -------------------------------------------------------------------------------------------
+
+    def _step(
+        self, index: int, timestamp: float, rgb: np.ndarray, depth: np.ndarray, given: np.ndarray | None
+    ) -> FrameResult:
+        if self.config.tracking.use_given_poses and given is None:
+            raise InputError(f"frame {index}: tracking.use_given_poses is on, but step() got no T_world_camera")
+        scale = self._settings.scale
+        self._images.set(0, rgb, depth * np.float32(scale))
+        self._current = index
+        timings: dict[str, float] = {}
+        values: dict[str, float] = {}
+        inliers, depth_error = 1.0, 0.0
+        first = not self._seen
+        if first or self.config.tracking.use_given_poses:
+            vector = vector_from_pose(np.eye(4) if given is None else given)
+        else:
+            start = time.perf_counter()
+            vector, loss, depth_error, inliers = self._track(index)
+            values["tracking"] = loss
+            timings["tracking"] = time.perf_counter() - start
+        self._append(vector, timestamp, "OK")
+        if first or index % self.config.mapping.every == 0:
+            start = time.perf_counter()
+            values["mapping"] = self._map(index, depth, first)
+            synchronize(self.device)
+            timings["mapping"] = time.perf_counter() - start
+        if not self.keyframes or index - self.keyframes[-1].index >= self.config.keyframes.every:
+            image = self._images.add(rgb, depth * np.float32(scale))
+            self.keyframes.append(Keyframe(index, image, self._vectors[index].copy()))
+        T = pose_from_vector(vector)
+        return FrameResult(index, timestamp, T, "OK", values, inliers, depth_error, timings)
+
+    def finish(self) -> dict[str, float]:
+        """Map the last frame if it was not, then train on a doubled window. Returns the seconds by phase."""
+        timings: dict[str, float] = {}
+        index, settings = self._current, self._settings
+        if index is None:
+            return timings
+        if self._mapped != index:
+            start = time.perf_counter()
+            self._map(index, self._images.depth_image(0) / np.float32(settings.scale), first=False)
+            timings["mapping"] = time.perf_counter() - start
+        if self.config.mapping.color_refinement:
+            start = time.perf_counter()
+            for round_ in range(settings.refinement_rounds):
+                self._train(index, settings.rounds + round_, settings.rounds * settings.iterations, doubled=True)
+            synchronize(self.device)
+            timings["refinement"] = time.perf_counter() - start
+        return timings
+
+    def _track(self, index: int) -> tuple[np.ndarray, float, float, float]:
+        """Pose vector [m], mean loss, mean depth error [m] and share of the rays with depth that are kept."""
+        start = self._scaled(self._initial_vector())
+        settings, batch = self._settings, self._tracking
+        iterations = settings.tracking_iterations
+        decay = self.config.tracking.final_rate_factor ** np.linspace(0.0, 1.0, iterations)[:, None]
+        self._poses.begin(start[None], settings.tracking_rate * decay * [1.0, 1.0])
+        batch.set_seeds([ray_seed(self.seed, _TRACKING, index, n) for n in range(iterations)])
+
+        def iterate() -> None:
+            with self._launcher.tape() as tape:
+                self._tracking_loss(Wanted(points=True), tape)
+            self._launcher.call(partial(tape.backward, batch.loss))
+            self._poses.update()
+            self._launcher.launch(adam.note_pose, 7, [batch.iteration, self._poses.poses, self._visited])
+            batch.next_iteration()
+
+        for _ in range(iterations):
+            self._launcher.iterate("track", self._uses(batch), iterate)
+        visited = self._visited.numpy().astype(np.float64)
+        candidates = [visited[-1], start, visited[len(visited) // 2 :].mean(axis=0)]
+        candidates = [vector for vector in candidates if np.isfinite(vector).all()]
+        return min((self._judge(index, vector) for vector in candidates), key=lambda result: result[1])
+
+    def _judge(self, index: int, vector: np.ndarray) -> tuple[np.ndarray, float, float, float]:
+        """`_track`'s result for a pose, on pixels that are the same for all of a frame's."""
+        batch = self._tracking
+        self._poses.begin(vector[None])
+        batch.set_seeds([ray_seed(self.seed, _TRACKING, index, -1)])
+        self._launcher.iterate("judge", self._uses(batch), self._tracking_loss)
+        measured = batch.measured_depth.numpy()[: batch.count]
+        inlier = batch.inlier.numpy()[: batch.count] != 0
+        count = int(inlier.sum())
+        metres = self._scaled(vector, 1.0 / self._settings.scale)
+        if not count:
+            return metres, np.inf, np.inf, 0.0
+        error = np.abs(measured - batch.depth.numpy()[: batch.count])[inlier].mean() / self._settings.scale
+        loss = float(batch.loss.numpy()[0]) / count
+        return metres, loss if np.isfinite(loss) else np.inf, float(error), count / int((measured > 0).sum())
+
+    def _tracking_loss(self, wanted: Wanted | None = None, tape: Tape | None = None) -> None:
+        config, batch, bound = self.config.tracking, self._tracking, self._bound
+        edges = {"edge_u": config.ignore_edge_u, "edge_v": config.ignore_edge_v}
+        batch.draw(self._images.arrays, self._slot_of_frame, batch.capacity, self.intrinsics, **edges)
+        batch.cast(self._poses.poses, differentiate=tape is not None)
+        batch.bound_to(bound.low, bound.high)
+        batch.evaluate(self.network, bound, wanted, tape, jitter=self.config.sampling.jitter)
+        batch.choose_inliers(0.0)
+        batch.tracking_loss(TRACKING_COLOR_WEIGHT)
+
+    def _initial_vector(self) -> np.ndarray:
+        """Constant speed (if on and known), else the last pose [m]."""
+        last = pose_from_vector(self._vectors[-1])
+        if self.config.tracking.constant_speed and self._status[-2:] == ["OK", "OK"]:
+            last = last @ np.linalg.inv(pose_from_vector(self._vectors[-2])) @ last
+        return vector_from_pose(last)
+
+    def _map(self, index: int, depth: np.ndarray, first: bool) -> float:
+        """Train on the frame and on keyframes; the mean loss a ray of the last iteration."""
+        seen = SeenDepth.of(index, depth)
+        self._seen.append(seen)
+        self._cover(seen)
+        self._mapped = index
+        if first:
+            return self._train(index, 0, self._settings.first_iterations)
+        return [self._train(index, n, self._settings.iterations) for n in range(self._settings.rounds)][-1]
+
+    def _train(self, index: int, round_: int, iterations: int, *, doubled: bool = False) -> float:
+        settings, batch = self._settings, self._mapping
+        slots, poses = self._window(index, round_, self.config.mapping.window * (2 if doubled else 1))
+        pixels = max(settings.mapping_pixels // slots.shape[0], 1)
+        self._optimizer.start(imap.WEIGHT_ROWS, np.arange(imap.WEIGHT_ROWS))
+        batch.set_seeds([ray_seed(self.seed, _MAPPING, index, n, round_) for n in range(iterations)])
+        bound, wanted = self._bound, Wanted(weights=self._optimizer.gradient)
+
+        def iterate(rate: float) -> None:
+            with self._launcher.tape() as tape:
+                batch.draw(self._images.arrays, slots, pixels, self.intrinsics)
+                batch.cast(poses)
+                batch.bound_to(bound.low, bound.high)
+                jitter, weight = self.config.sampling.jitter, settings.empty_weight
+                batch.evaluate(self.network, bound, wanted, tape, jitter=jitter, empty_weight=weight)
+                batch.mapping_loss(settings.color_weight)
+                batch.add_empty_loss(settings.empty_weight)
+            self._launcher.call(partial(tape.backward, batch.loss))
+            self._optimizer.update(self.network.weights, rate)
+            self.network.transpose()
+            batch.next_iteration()
+
+        for n in range(iterations):
+            rate = settings.mapping_rate * DECAY ** (n // DECAY_STEPS)
+            uses = (slots, poses, rate, self._optimizer.rows, *self._uses(batch))
+            self._launcher.iterate("train", uses, partial(iterate, rate))
+        return float(batch.loss.numpy()[0]) / max(batch.count, 1)
+
+    def _window(self, index: int, round_: int, size: int) -> tuple[wp.array, wp.array]:
+        """Image slots and poses of random keyframes from all but the last, of the last one, and of the frame."""
+        chosen: list[Keyframe] = []
+        if self.keyframes and size > 1:
+            *others, last = self.keyframes
+            rng = np.random.default_rng([self.seed, _MAPPING, index, round_])
+            chosen = [others[n] for n in rng.permutation(len(others))[: max(size - 2, 0)]] + [last]
+        vectors = [*(keyframe.pose for keyframe in chosen), self._vectors[index]]
+        poses = np.stack([self._scaled(vector) for vector in vectors]).astype(np.float32)
+        slots = [*self._images.bring([keyframe.image for keyframe in chosen]), 0]
+        return wp.array(slots, dtype=int, device=self.device), wp.array(poses, dtype=float, device=self.device)
+
+    def _uses(self, batch: ImapBatch) -> tuple:
+        """What a recorded iteration stands on."""
+        return (batch.seeds, self._poses.poses, self._poses.rates, *self._images.arrays, *self._low, *self._high)
+
+    def _cover(self, seen: SeenDepth) -> None:
+        """Grow the bound to hold all that a frame measures, and its camera."""
+        view = self._view(seen)
+        points = np.concatenate([view.points(), view.T_world_camera[None, :3, 3]])
+        low, high = points.min(axis=0), points.max(axis=0)
+        if (low < self._low).any() or (high > self._high).any():
+            margin = self.config.grid.margin
+            self._low, self._high = np.minimum(self._low, low - margin), np.maximum(self._high, high + margin)
+
+    @property
+    def _bound(self) -> Bound:
+        scale = self._settings.scale
+        return Bound(wp.vec3(*(scale * self._low)), wp.vec3(*(scale * self._high)))
+
+    def _scaled(self, vector: np.ndarray, scale: float | None = None) -> np.ndarray:
+        """A pose vector with its translation in other units, network units by default."""
+        return np.concatenate([vector[:4], vector[4:] * (self._settings.scale if scale is None else scale)])
+
+    def _view(self, seen: SeenDepth) -> ObservedView:
+        camera = self.intrinsics.strided(SEEN_STRIDE)
+        return ObservedView(seen.depth(), camera, pose_from_vector(self._vectors[seen.index]))
+
+    # -- what came out -------------------------------------------------------------------------------------------
+
+    @property
+    def map_bytes(self) -> int:
+        """Memory of the network's weights."""
+        return 4 * weight_count("imap")
+
+    @property
+    def flops_per_point(self) -> int:
+        """Operations of the network at a point, forward (see `warpslam.complexity`)."""
+        return flops_per_point("imap")
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner of the mapped region, float64 (3,) each [m]."""
+        return self._low, self._high
+
+    def query_occupancy(self, points: np.ndarray, level: str = "fine") -> np.ndarray:
+        """Density before the ReLU, float32 (N,), at world points (N, 3) [m]; there is one level."""
+        return self._query(points, lambda batch: batch.density)
+
+    def query_color(self, points: np.ndarray) -> np.ndarray:
+        """Colours in [0, 1], float32 (N, 3), at world points (N, 3) [m]."""
+        return np.clip(self._query(points, lambda batch: batch.color), 0.0, 1.0)
+
+    def _query(self, points: np.ndarray, wanted: Callable[[ImapBatch], wp.array]) -> np.ndarray:
+        if self._queries is None:
+            self._queries = ImapBatch(_VIEW_POINTS, 1, 0, 0, self._launcher, training=False)
+        batch = self._queries
+        scaled = np.asarray(points, np.float32) * np.float32(self._settings.scale)
+        parts = []
+        for start in range(0, len(scaled), _VIEW_POINTS):
+            batch.query_points(self.network, scaled[start : start + _VIEW_POINTS])
+            parts.append(wanted(batch).numpy()[: batch.count].copy())
+        return np.concatenate(parts) if parts else wanted(batch).numpy()[:0]
+
+    def mesh(self, voxel: float | None = None) -> trimesh.Trimesh:
+        """Coloured mesh of what the mapped frames saw, in the world frame.
+
+        Args:
+            voxel: Edge of a marching-cubes cell [m]; `MeshingConfig.voxel` by default.
+
+        Raises:
+            MeshError: nothing was seen, or there is no surface.
+        """
+        config = self.config.meshing
+        return extract_mesh(
+            self,
+            [self._view(seen) for seen in self._seen],
+            voxel=voxel or config.voxel,
+            level_set=self._settings.level_set,
+            min_component_area=config.min_component_area,
+        )
+
+    def render(self, T_world_camera: np.ndarray, *, depth: np.ndarray | None = None, stride: int = 1) -> RenderedImage:
+        """View of the map from a pose, every ``stride``-th pixel; a ``depth`` image [m] guides the samples if given.
+
+        Raises:
+            InputError: the map is empty, or the pose is no rigid transform.
+        """
+        if not self._seen:
+            raise InputError("the map is empty: step at least one frame first")
+        scale, camera = self._settings.scale, self.intrinsics
+        vector = self._scaled(vector_from_pose(check_transform(T_world_camera)))
+        pose = wp.array(vector[None].astype(np.float32), dtype=float, device=self.device)
+        width, height = -(-camera.width // stride), -(-camera.height // stride)
+        rows = max(1, _VIEW_POINTS // ((_VIEW_STRATIFIED + _VIEW_IMPORTANCE) * width))
+        batch = ImapBatch(rows * width, _VIEW_STRATIFIED, _VIEW_IMPORTANCE, 0, Launcher(self.device), training=False)
+        out = RenderedImage(*(np.zeros((height, width, *c), np.float32) for c in ((), (3,), ())))
+        guided, bound = depth is not None, self._bound
+        for first in range(0, height, rows):
+            count = min(rows, height - first)
+            batch.set_pixels(first, count, camera, stride)
+            batch.cast(pose)
+            if depth is not None:
+                part = np.ascontiguousarray(depth[::stride, ::stride][first : first + count], np.float32)
+                batch.measured_depth[: batch.count].assign(scale * part.reshape(-1))
+            batch.bound_to(bound.low, bound.high, use_depth=guided)
+            batch.evaluate(self.network, bound, use_depth=guided)
+            arrays = ((out.depth, batch.depth, 1 / scale), (out.rgb, batch.rgb, 1.0))
+            for image, array, unit in (*arrays, (out.variance, batch.variance, 1 / scale**2)):
+                values = array.numpy()[: batch.count].reshape(count, width, *image.shape[2:])
+                image[first : first + count] = np.float32(unit) * values
+        np.clip(out.rgb, 0.0, 1.0, out=out.rgb)
+        return out
+
+    def save(self, path: str | Path) -> None:
+        """Write network, trajectory and what was seen to one .npz file (no pickled code), for views and meshes."""
+        path = Path(path)
+        header = {"format": FORMAT, "seed": self.seed, "config": self.config.model_dump()}
+        header |= {"intrinsics": vars(self.intrinsics), "status": self._status}
+        arrays: dict[str, Any] = {
+            "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
+            "timestamps": np.array(self._timestamps),
+            "vectors": np.array(self._vectors).reshape(-1, 7),
+            "bounds": np.stack([self._low, self._high]),
+            "seen_frames": np.array([seen.index for seen in self._seen], np.int64),
+            "seen": np.array([seen.millimetres for seen in self._seen], np.uint16),
+        }
+        arrays |= {f"network:{name}": array for name, array in self.network.tensors().items()}
+        temporary = path.with_name(path.name + ".part")
+        with open(temporary, "wb") as file:
+            np.savez(file, **arrays)
+        os.replace(temporary, path)
+
+    @classmethod
+    def load(cls, path: str | Path, device: str | None = None) -> Imap:
+        """Read what `save` wrote, for views and meshes; images of keyframes are not in it.
+
+        Raises:
+            CheckpointError: the file is missing, damaged, or no network of iMAP*.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
+            header = json.loads(arrays["header"].tobytes())
+            if header["format"] != FORMAT:
+                raise CheckpointError(f"{path}: is no map of iMAP* of this version; run again with --method imap")
+            config = Config.model_validate(header["config"])
+            result = cls(Intrinsics(**header["intrinsics"]), config, device, header["seed"])
+            tensors = {name.split(":", 1)[1]: a for name, a in arrays.items() if name.startswith("network:")}
+            result.network = ImapNetwork(tensors, result._launcher)
+            result._timestamps = [float(t) for t in arrays["timestamps"]]
+            result._vectors, result._status = list(arrays["vectors"]), header["status"]
+            result._low, result._high = arrays["bounds"]
+            pairs = zip(arrays["seen_frames"], arrays["seen"], strict=True)
+            result._seen = [SeenDepth(int(index), millimetres) for index, millimetres in pairs]
+        except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise CheckpointError(f"{path}: can't be read as a map of iMAP* ({error}); use another copy") from error
+        return result
+
+
+def _compile(device: wp.Device) -> float:
+    """Load the kernel modules that this method needs, and none of NICE-SLAM's decoders; the seconds it took."""
+    start = time.perf_counter()
+    names = [module.__name__ for module in (adam, density, losses, rays)]
+    for name in [*names, f"warpslam.imap_{'cuda' if device.is_cuda else 'cpu'}"]:
+        wp.get_module(name).load(device)
+    return time.perf_counter() - start

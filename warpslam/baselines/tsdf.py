@@ -1,0 +1,251 @@
+"""TSDF fusion at given poses (Curless & Levoy 1996; Newcombe et al. 2011): the classical map, without tracking.
+
+Open3D's voxel block grid does the work: 16^3 voxels a block, blocks allocated along the measured surface only. A voxel
+holds a truncated distance (float32), a weight and a colour (uint16 each, three channels): 12 bytes.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warpslam.baselines.base import Baseline
+from warpslam.camera import Intrinsics, check_transform, vector_from_pose
+from warpslam.config import Config
+from warpslam.errors import CheckpointError, InputError, MeshError, MissingDependencyError
+from warpslam.rendering import RenderedImage
+from warpslam.slam import FrameResult
+
+if TYPE_CHECKING:
+    import trimesh
+
+FORMAT = "warpslam-tsdf-1"
+BLOCK_VOXELS = 16
+BYTES_PER_VOXEL = 12
+_FIRST_CAPACITY = 2000  # blocks; Open3D allocates more as they are needed
+
+
+def import_open3d() -> Any:
+    """The package open3d.
+
+    Raises:
+        MissingDependencyError: it is not installed, or lacks a system library.
+    """
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise MissingDependencyError(
+            f"--method tsdf needs Open3D, which can't be loaded ({error}). Type: pip install warpslam[open3d]; on "
+            "Debian and Ubuntu it needs libraries as well: apt-get install libusb-1.0-0 libgl1 libegl1"
+        ) from error
+    return open3d
+
+
+class Tsdf(Baseline):
+    """A truncated signed distance field fused from frames with known poses.
+
+    Frames without a pose are skipped. Settings: `TsdfConfig`, and ``grid.max_depth``.
+    """
+
+    name = "tsdf"
+
+    def __init__(
+        self, intrinsics: Intrinsics, config: Config | None = None, device: str | None = None, seed: int = 0
+    ) -> None:
+        """An empty volume.
+
+        Args:
+            intrinsics: Camera of all frames.
+            config: Settings, `Config()` by default.
+            device: "cpu" or "cuda:0"; by default the CPU, as the package's wheels come without CUDA.
+            seed: Not used: fusion has no random choice.
+        """
+        super().__init__(intrinsics, config if config is not None else Config(), seed)
+        self._o3d = import_open3d()
+        self.device = device or "cpu"
+        core = self._o3d.core
+        try:
+            self._device = core.Device(self.device.upper() if ":" in self.device else f"{self.device.upper()}:0")
+            self._grid = self._o3d.t.geometry.VoxelBlockGrid(
+                ("tsdf", "weight", "color"), (core.float32, core.uint16, core.uint16), ((1,), (1,), (3,)),
+                self.config.tsdf.voxel, BLOCK_VOXELS, _FIRST_CAPACITY, self._device,
+            )  # fmt: skip
+        except RuntimeError as error:
+            raise InputError(f"device = {device!r}: Open3D can't use it ({error}); use cpu") from error
+        self._camera = core.Tensor(intrinsics.matrix)
+
+    def _step(
+        self, index: int, timestamp: float, rgb: np.ndarray, depth: np.ndarray, given: np.ndarray | None
+    ) -> FrameResult:
+        if given is None:
+            return self._skip(index, timestamp, "no pose is given, and TSDF fusion can't track")
+        start = time.perf_counter()
+        for name in ("_surface", "_scene"):
+            self.__dict__.pop(name, None)
+        image = self._o3d.t.geometry.Image
+        depth_image, rgb_image = image(self._tensor(depth)), image(self._tensor(rgb.astype(np.float32) / 255.0))
+        # Open3D wants cameras on the CPU, whatever the device of the volume.
+        extrinsic = self._o3d.core.Tensor(np.linalg.inv(given))
+        limits = (1.0, self.config.grid.max_depth, self.config.tsdf.truncation_voxels)
+        with self._quiet():
+            blocks = self._grid.compute_unique_block_coordinates(depth_image, self._camera, extrinsic, *limits)
+            self._grid.integrate(blocks, depth_image, rgb_image, self._camera, self._camera, extrinsic, *limits)
+        self._append(vector_from_pose(given), timestamp, "OK")
+        return FrameResult(index, timestamp, given, timings={"mapping": time.perf_counter() - start})
+
+    def finish(self) -> dict[str, float]:
+        """Nothing is left to do."""
+        return {}
+
+    @property
+    def block_count(self) -> int:
+        """Blocks that hold something."""
+        return int(self._grid.hashmap().size())
+
+    @property
+    def map_bytes(self) -> int:
+        """Memory of the allocated blocks."""
+        return self.block_count * BLOCK_VOXELS**3 * BYTES_PER_VOXEL
+
+    @property
+    def flops_per_point(self) -> None:
+        """None: the map is looked up."""
+
+    def mesh(self, voxel: float | None = None) -> trimesh.Trimesh:
+        """Coloured zero crossing of the distance, in the world frame.
+
+        Args:
+            voxel: Must be that of the volume, or None: the mesh has no other resolution.
+
+        Raises:
+            MeshError: there is no surface.
+            InputError: another voxel is asked for.
+        """
+        import trimesh
+
+        if voxel is not None and voxel != self.config.tsdf.voxel:
+            raise InputError(f"voxel = {voxel}: the volume has {self.config.tsdf.voxel} m; run with --set tsdf.voxel")
+        vertices, faces, colors = self._surface
+        rgb = np.rint(255.0 * colors).astype(np.uint8)
+        return trimesh.Trimesh(vertices, faces, vertex_colors=rgb, process=False)
+
+    def render(self, T_world_camera: np.ndarray, *, depth: np.ndarray | None = None, stride: int = 1) -> RenderedImage:
+        """View of the mesh, every ``stride``-th pixel; black with depth 0 where nothing is hit. ``depth`` is not used.
+
+        Rays are cast against the mesh and not with Open3D's cast through the voxels, which returns depths half a voxel
+        short, and on its first call an image with holes.
+
+        Raises:
+            InputError: the volume is empty, or the pose is no rigid transform.
+            MeshError: there is no surface.
+        """
+        T = check_transform(T_world_camera)
+        if self.block_count == 0:
+            raise InputError("the volume is empty: step at least one frame with a pose first")
+        vertices, faces, colors = self._surface
+        camera = self.intrinsics.strided(stride)
+        v, u = np.mgrid[: camera.height, : camera.width]
+        local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+        # Directions have length 1 along the camera's z axis, so that the way to a hit is its z-depth.
+        directions = local @ T[:3, :3].T
+        rays = np.concatenate([np.broadcast_to(T[:3, 3], directions.shape), directions], axis=-1).astype(np.float32)
+        hits = self._scene.cast_rays(self._o3d.core.Tensor(rays))
+        z, face, uv = (hits[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs"))
+        found = np.isfinite(z)
+        corners = colors[faces[face[found]]]
+        weights = np.concatenate([1.0 - uv[found].sum(axis=1, keepdims=True), uv[found]], axis=1)
+        rgb = np.zeros((*z.shape, 3), np.float32)
+        rgb[found] = np.einsum("nk,nkc->nc", weights, corners)
+        return RenderedImage(np.where(found, z, np.float32(0.0)), rgb, np.zeros_like(z))
+
+    @cached_property
+    def _surface(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Vertices (V, 3) float32 [m], faces (F, 3), and colours in [0, 1] (V, 3) of the volume as it is."""
+        min_weight = self.config.tsdf.min_weight
+        if self.block_count == 0:
+            raise MeshError("the volume is empty: step at least one frame with a pose first")
+        with self._quiet():
+            # Open3D wants more than its threshold.
+            mesh = self._grid.extract_triangle_mesh(min_weight - 0.5).cpu()
+        faces = mesh.triangle.indices.numpy() if "indices" in mesh.triangle else np.zeros((0, 3))
+        if len(faces) == 0:
+            raise MeshError(
+                f"no surface in {self.block_count} blocks: fuse more frames or lower tsdf.min_weight (now {min_weight})"
+            )
+        return mesh.vertex.positions.numpy(), faces, np.clip(mesh.vertex.colors.numpy(), 0.0, 1.0)
+
+    @cached_property
+    def _scene(self) -> Any:
+        vertices, faces, _ = self._surface
+        scene = self._o3d.t.geometry.RaycastingScene()
+        core = self._o3d.core
+        scene.add_triangles(core.Tensor(vertices), core.Tensor(faces.astype(np.uint32)))
+        return scene
+
+    def save(self, path: str | Path) -> None:
+        """Write the volume and the trajectory to one .npz file (no pickled code)."""
+        path = Path(path)
+        keys, rows = self._active()
+        arrays = {name: self._grid.attribute(name)[rows].cpu().numpy() for name in ("tsdf", "weight", "color")}
+        temporary = path.with_name(path.name + ".part")
+        with open(temporary, "wb") as file:
+            np.savez_compressed(
+                file,
+                format=np.array(FORMAT),
+                config=np.array(self.config.model_dump_json()),
+                intrinsics=np.array(list(vars(self.intrinsics).values())),
+                keys=keys.cpu().numpy(),
+                timestamps=np.array(self._timestamps),
+                vectors=np.array(self._vectors).reshape(-1, 7),
+                status=np.array(self._status, dtype=str),
+                **arrays,
+            )
+        os.replace(temporary, path)
+
+    @classmethod
+    def load(cls, path: str | Path, device: str | None = None) -> Tsdf:
+        """Read what `save` wrote; the result goes on from the last frame.
+
+        Raises:
+            CheckpointError: the file is missing, damaged, or no TSDF volume.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
+            if str(arrays.get("format")) != FORMAT:
+                raise CheckpointError(f"{path}: is no TSDF volume of this version; run again with --method tsdf")
+            fx, fy, cx, cy, width, height = arrays["intrinsics"].tolist()
+            config = Config.model_validate_json(str(arrays["config"]))
+            tsdf = cls(Intrinsics(fx, fy, cx, cy, int(width), int(height)), config, device)
+            tsdf._timestamps = [float(t) for t in arrays["timestamps"]]
+            tsdf._vectors, tsdf._status = list(arrays["vectors"]), [str(s) for s in arrays["status"]]
+            if len(arrays["keys"]):
+                values = [tsdf._tensor(arrays[name]) for name in ("tsdf", "weight", "color")]
+                tsdf._grid.hashmap().insert(tsdf._tensor(arrays["keys"]), values)
+        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise CheckpointError(f"{path}: can't be read as a TSDF volume ({error}); use another copy") from error
+        return tsdf
+
+    def _active(self) -> tuple[Any, Any]:
+        """Coordinates of the allocated blocks, and their rows in the attributes."""
+        hashmap = self._grid.hashmap()
+        rows = hashmap.active_buf_indices().to(self._o3d.core.int64)
+        return hashmap.key_tensor()[rows], rows
+
+    def _tensor(self, array: np.ndarray) -> Any:
+        return self._o3d.core.Tensor(np.ascontiguousarray(array), device=self._device)
+
+    @contextmanager
+    def _quiet(self) -> Iterator[None]:
+        """Keep Open3D's lines about buffers that grow out of the output; its errors stay."""
+        utility = self._o3d.utility
+        with utility.VerbosityContextManager(utility.VerbosityLevel.Error):
+            yield

@@ -1,0 +1,30 @@
+"""``warpslam report``."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from warpslam.cli.common import add_command, quiet_warp
+
+
+def add(commands: Any) -> None:
+    """Add the command."""
+    report = add_command(commands, "report", _report, "HTML report of a run, or a comparison of several")
+    report.add_argument("runs", nargs="+", metavar="RUN", help="run folder; several make a comparison")
+    report.add_argument(
+        "-o", "--output", metavar="FILE", help="HTML file (default: RUN/report.html; comparison.html for several)"
+    )
+
+
+def _report(options: argparse.Namespace) -> int:
+    from warpslam.report import write_comparison, write_report
+    from warpslam.run_folder import RunFolder
+
+    quiet_warp()
+    folders = [RunFolder.open(run) for run in options.runs]
+    if len(folders) == 1:
+        print(write_report(folders[0], options.output))
+    else:
+        print(write_comparison(options.output or "comparison.html", folders))
+    return 0

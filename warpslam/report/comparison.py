@@ -1,0 +1,195 @@
+"""Several runs side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from warpslam.report import charts
+from warpslam.report.data import RunData
+from warpslam.report.page import Html, element, figures, join, missing, page, section, table, void, write_page
+from warpslam.report.text import centimetres, decibels, duration, megabytes, percent
+from warpslam.run_folder import RunFolder
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A figure of each run.
+
+    title: Its name. path: Where metrics.json has it. text: How it is written. lower_is_better: Which value is best.
+    """
+
+    title: str
+    path: tuple[str, ...]
+    text: Callable[[float], str | None]
+    lower_is_better: bool = True
+
+
+FIGURES = (
+    Figure("ATE RMSE", ("ate_m", "aligned", "rmse"), centimetres),
+    Figure("Mesh accuracy", ("reconstruction", "accuracy_m"), centimetres),
+    Figure("Mesh completion", ("reconstruction", "completion_m"), centimetres),
+    Figure("Within 5 cm", ("reconstruction", "completion_ratio_5cm"), percent, lower_is_better=False),
+    Figure("Depth L1", ("rendering", "depth_l1_m"), centimetres),
+    Figure("PSNR", ("rendering", "psnr_db"), decibels, lower_is_better=False),
+    Figure("Speed", ("fps",), lambda fps: f"{fps:.2f} fps", lower_is_better=False),
+    Figure("Time", ("seconds", "run"), duration),
+    Figure("Peak memory", ("peak_memory_mib",), lambda mib: megabytes(mib * 2**20)),
+)
+
+
+def write_comparison(path: str | Path, runs: Sequence[RunFolder | RunData]) -> Path:
+    """Write a page that compares runs.
+
+    Args:
+        path: HTML file.
+        runs: Run folders or what was gathered of them, in the order of the page; each links to its own report where
+            that lies beside it.
+
+    Raises:
+        DatasetError: A file of a run is damaged.
+        MeshError: A mesh can't be read.
+        ConfigError: The page can't be written there.
+    """
+    path = Path(path)
+    gathered = [run if isinstance(run, RunData) else RunData.gather(run) for run in runs]
+    names = run_names(gathered)
+    sections = [
+        ("table", "Figures", table_section(gathered, names, path.parent)),
+        ("bars", "Bars", bars_section(gathered, names)),
+        ("meshes", "Meshes", meshes_section(gathered, names)),
+        ("runs", "Runs", runs_section(gathered, names)),
+    ]
+    sequences = sorted({run.name for run in gathered})
+    header = join(
+        element("p", "warpslam comparison", class_="kicker"),
+        element("h1", f"{len(gathered)} runs"),
+        element("p", " · ".join(sequences), class_="facts"),
+    )
+    return write_page(page("Comparison · warpslam", header, sections), path)
+
+
+def run_names(runs: Sequence[RunData]) -> list[str]:
+    """A name a run, as short as tells them apart: the ends of their folders."""
+    paths = [run.folder.path.resolve().parts for run in runs]
+    for length in range(1, max(map(len, paths), default=1) + 1):
+        names = ["/".join(parts[-length:]) for parts in paths]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{'/'.join(parts[-1:])} ({n})" for n, parts in enumerate(paths, start=1)]
+
+
+def table_section(runs: Sequence[RunData], names: Sequence[str], base: Path) -> Html:
+    """All figures; the best of each in bold."""
+    shown = [figure for figure in FIGURES if any(run.figure(*figure.path) is not None for run in runs)]
+    best = {figure: _best(figure, runs) for figure in shown}
+    facts: list[tuple[str, Callable[[RunData], str]]] = [
+        ("status", lambda run: str(run.figure("status") or "unknown")),
+        ("tracked", _frames),
+    ]
+    if len({run.name for run in runs}) > 1:
+        facts.insert(0, ("sequence", lambda run: run.name))
+    if any(run.figure("method") for run in runs):
+        facts.insert(0, ("method", lambda run: str(run.figure("method") or "–")))
+    rows = []
+    for run, name in zip(runs, names, strict=True):
+        cells: list[str] = [_link(run, name, base)]
+        cells += [text(run) for _, text in facts]
+        for figure in shown:
+            value = run.figure(*figure.path)
+            text = "–" if value is None else figure.text(value) or "–"
+            cells.append(element("strong", text) if value is not None and value == best[figure] else text)
+        rows.append(cells)
+    head = ["run", *(title for title, _ in facts), *(figure.title for figure in shown)]
+    absent = [figure.title for figure in FIGURES if figure not in shown]
+    note = missing(f"No run has: {', '.join(absent)}.") if absent else None
+    return section("table", "Figures", table(head, rows, "numbers"), note)
+
+
+def bars_section(runs: Sequence[RunData], names: Sequence[str]) -> Html:
+    """Each figure as bars, one a run."""
+    blocks = []
+    for figure in FIGURES:
+        values = [run.figure(*figure.path) for run in runs]
+        known = [value for value in values if value is not None]
+        if not known:
+            continue
+        best = _best(figure, runs)
+        rows = [
+            [
+                name,
+                "–" if value is None else figure.text(value) or "–",
+                charts.value_bar(value or 0.0, max(known), "c2" if value is not None and value == best else "c0"),
+            ]
+            for name, value in zip(names, values, strict=True)
+        ]
+        order = "lower is better" if figure.lower_is_better else "higher is better"
+        heading = element("h3", figure.title, element("small", order))
+        blocks.append(element("div", heading, table(("", "", ""), rows, "numbers bars")))
+    content = element("div", blocks, class_="pair") if blocks else missing("No run has figures to compare.")
+    return section("bars", "Figure by figure", content)
+
+
+def meshes_section(runs: Sequence[RunData], names: Sequence[str]) -> Html:
+    """A picture of each mesh, all from above."""
+    from warpslam.report.sections import views_of
+
+    pictures = []
+    for run, name in zip(runs, names, strict=True):
+        views = views_of(run, limit=2)[-1:]
+        if views:
+            content = void("img", src=views[0].uri, alt=f"mesh of {name}", class_="thumbnail")
+            pictures.append(element("figure", content, element("figcaption", element("strong", name))))
+        else:
+            pictures.append(element("figure", missing("no mesh"), element("figcaption", element("strong", name))))
+    return section("meshes", "Meshes", element("div", pictures, class_="views"))
+
+
+def runs_section(runs: Sequence[RunData], names: Sequence[str]) -> Html:
+    """How each run was made."""
+    blocks = []
+    for run, name in zip(runs, names, strict=True):
+        command = run.source.command if run.source is not None else None
+        error = run.figure("error")
+        facts = [
+            ("Device", str(run.figure("device") or "") or None, f"warpslam {run.figure('warpslam')}"),
+            ("Seed", None if run.figure("seed") is None else str(run.figure("seed")), ""),
+        ]
+        blocks.append(
+            element(
+                "div",
+                element("h3", name, element("small", run.name)),
+                element("p", f"It failed: {error}", class_="failure") if error else None,
+                element("pre", element("code", command)) if command else missing("Started by a program, no command."),
+                element("details", element("summary", "Settings"), figures(facts), element("pre", run.config))
+                if run.config is not None
+                else missing("The run did not write its settings."),
+            )
+        )
+    return section("runs", "Runs", blocks)
+
+
+def _best(figure: Figure, runs: Sequence[RunData]) -> float | None:
+    # What a run that broke off saved in time or memory is no merit.
+    finished = [run for run in runs if run.figure("status") == "finished"]
+    values = [value for run in finished if (value := run.figure(*figure.path)) is not None]
+    if len(values) < 2:
+        return None
+    return min(values) if figure.lower_is_better else max(values)
+
+
+def _frames(run: RunData) -> str:
+    counts = run.figure("frames") or {}
+    return f"{counts['OK']} of {counts['selected']}" if {"OK", "selected"} <= counts.keys() else "–"
+
+
+def _link(run: RunData, name: str, base: Path) -> Html | str:
+    """The name, leading to the run's report by a relative path where there is one below the page's folder."""
+    from urllib.parse import quote
+
+    try:
+        relative = run.folder.report.resolve().relative_to(base.resolve())
+    except ValueError:
+        return name
+    return element("a", name, href=quote(relative.as_posix())) if run.folder.report.is_file() else name
