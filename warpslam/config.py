@@ -222,13 +222,13 @@ class Config(_Group):
     mapping: MappingConfig = Field(default_factory=MappingConfig)
     keyframes: KeyframeConfig = Field(default_factory=KeyframeConfig)
     meshing: MeshingConfig = Field(default_factory=MeshingConfig)
+    imap: ImapConfig = Field(default_factory=ImapConfig)
+    tsdf: TsdfConfig = Field(default_factory=TsdfConfig)
     schedule: Literal["strict", "overlapped"] = Field(
         "strict",
         description="strict: mapping after tracking, runs repeat to the bit; overlapped: beside it, and the map is at "
         "most one mapping interval behind",
     )
-    imap: ImapConfig = Field(default_factory=ImapConfig)
-    tsdf: TsdfConfig = Field(default_factory=TsdfConfig)
     decoders: str | None = Field(None, description="decoder checkpoint; the package's own when empty")
 
     @classmethod

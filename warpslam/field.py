@@ -10,7 +10,7 @@ An optimisation iteration reads
     launcher.call(lambda: tape.backward(batch.loss))
 
 `RayBatch.cast` and the losses have generated adjoints; compositing and the decoders have hand-written ones, attached
-with `Tape.record_func`. All launches go through a `warpslam.launching.Launcher`, which can record and replay them.
+with `wp.Tape.record_func`. All launches go through a `warpslam.launching.Launcher`, which can record and replay them.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from warpslam.camera import Intrinsics
 from warpslam.decoders import DecoderWeights
 from warpslam.kernels import adam, compositing, decoder, gauss_newton, losses, rays
 from warpslam.kernels.grid import Lattice, Vec32
-from warpslam.launching import Launcher, Step, Tape, decoders_for, run_slices, slice_count
+from warpslam.launching import Launcher, Step, decoders_for, run_slices, slice_count
 
 STAGES = ("coarse", "middle", "fine", "color")
 GROUP_SIZE = {"cpu": 8, "cuda": 16}
@@ -329,7 +329,7 @@ class RayBatch:
         arrays: FieldArrays,
         stage: str,
         gradients: Gradients | None = None,
-        tape: Tape | None = None,
+        tape: wp.Tape | None = None,
         *,
         thresholds: Thresholds = EXACT,
     ) -> None:

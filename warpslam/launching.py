@@ -9,7 +9,7 @@ order in every run.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import lru_cache, partial
@@ -42,29 +42,6 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max_workers=2 * (MAX_SLICES - 1), thread_name_prefix="warpslam")
 
 
-class Tape:
-    """Backward passes of the launches of one `Launcher`, to be run in reverse.
-
-    A `wp.Tape` is the whole process's: it would take up what other threads launch meanwhile, and only one thread at a
-    time could have one. This one holds what its launcher was told to record and nothing else.
-    """
-
-    def __init__(self) -> None:
-        self._steps: list[Callable[[], Any]] = []
-
-    def record_func(self, backward: Callable[[], Any], arrays: Sequence[wp.array] = ()) -> None:
-        """Append a backward pass, which adds to the gradients of some inputs from those of the outputs ``arrays``."""
-        if any(array.grad is None for array in arrays):
-            raise ValueError("an output on the tape has no gradient: make it with requires_grad=True")
-        self._steps.append(backward)
-
-    def backward(self, loss: wp.array) -> None:
-        """Gradients of ``loss``, float (1,), by everything that it was computed from."""
-        loss.grad.fill_(1.0)
-        for step in reversed(self._steps):
-            step()
-
-
 class Launcher:
     """Launches kernels on a device, and records the iterations that are repeated (`iterate`) for replay.
 
@@ -74,7 +51,7 @@ class Launcher:
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self._program: Program | None = None
-        self._tape: Tape | None = None
+        self._tape: wp.Tape | None = None
         self._kinds: dict[str, tuple[tuple, Program]] = {}
 
     def iterate(self, kind: str, uses: tuple, iteration: Callable[[], None]) -> None:
@@ -104,9 +81,12 @@ class Launcher:
         self.call(self.command(kernel, dim, inputs).launch)
 
     @contextmanager
-    def tape(self) -> Iterator[Tape]:
-        """A tape that is active within the ``with`` block: it gets the adjoints of this launcher's taped launches."""
-        self._tape = Tape()
+    def tape(self) -> Iterator[wp.Tape]:
+        """A `wp.Tape` that gets the adjoints of this launcher's taped launches within the ``with`` block.
+
+        It is never entered itself: an entered tape is the whole process's, and would take up what other threads launch.
+        """
+        self._tape = wp.Tape()
         try:
             yield self._tape
         finally:
@@ -130,7 +110,7 @@ class Launcher:
             record_cmd=True,
             record_tape=False,
         )
-        self._tape.record_func(adjoint.launch)
+        self._tape.record_func(adjoint.launch, [array for array in outputs if array.requires_grad])
 
     def slices(self, count: int, steps: Callable[[int, int, int], list[Step]]) -> None:
         """Launches that work on rays (or rows) apart: ``steps(first, stop, slot)`` for each slice of ``count``."""

@@ -13,7 +13,7 @@ from warpslam.config import SamplingConfig, TrackingConfig
 from warpslam.field import FieldArrays, Gradients, RayBatch, Thresholds
 from warpslam.kernels import adam
 from warpslam.keyframes import ImagePool
-from warpslam.launching import Launcher, Tape
+from warpslam.launching import Launcher
 from warpslam.optimizers import PoseOptimizer
 
 
@@ -149,7 +149,7 @@ class Tracker:
         )
 
     def _render(
-        self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, tape: Tape | None = None
+        self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, tape: wp.Tape | None = None
     ) -> None:
         config, sampling = self.config, self.sampling
         edges = {"edge_u": config.ignore_edge_u, "edge_v": config.ignore_edge_v}

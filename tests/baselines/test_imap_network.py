@@ -61,7 +61,7 @@ class Case:
         """Loss, images and all gradients from the kernels."""
         batch = self.batch
         gradient = gradient_buffers(imap.WEIGHT_ROWS, batch.device)
-        with self.launcher.tape() as tape:
+        with batch.launcher.tape() as tape:
             batch.cast(self.poses)
             batch.bound_to(self.bound.low, self.bound.high)
             # All rays take part, so that samples outside the bound are covered.
@@ -191,7 +191,7 @@ def test_rays_that_are_not_kept_have_no_part():
     """They render nothing and add nothing to the loss or its gradient."""
     case = Case()
     batch, gradient = case.batch, gradient_buffers(imap.WEIGHT_ROWS, wp.get_device("cpu"))
-    with case.launcher.tape() as tape:
+    with batch.launcher.tape() as tape:
         batch.cast(case.poses)
         batch.bound_to(case.bound.low, case.bound.high)
         batch.keep.zero_()

@@ -13,7 +13,6 @@ from warpslam.decoders import DecoderWeights
 from warpslam.field import FieldArrays, Gradients, GridGradient, PackedDecoder, RayBatch, gradient_buffers
 from warpslam.kernels import decoder
 from warpslam.kernels.grid import Lattice, Vec32
-from warpslam.launching import Tape
 
 MAPPED_LEVELS = {
     "coarse": ("coarse",),
@@ -99,7 +98,7 @@ class Iteration:
         self.batch.bound(self.arrays)
         self.batch.place_samples(oracle.STRATIFIED_COUNT, oracle.SURFACE_COUNT, use_depth=self.stage != "coarse")
 
-    def render(self, gradients: Gradients | None = None, tape: Tape | None = None) -> None:
+    def render(self, gradients: Gradients | None = None, tape: wp.Tape | None = None) -> None:
         """Depth, colour and variance of the rays that are cast."""
         self.batch.render(self.arrays, self.stage, gradients, tape)
 

@@ -32,7 +32,7 @@ from warpslam.config import Config
 from warpslam.errors import CheckpointError, InputError
 from warpslam.kernels import adam, density, imap, losses, rays
 from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth
-from warpslam.launching import Launcher, Tape, synchronize
+from warpslam.launching import Launcher, synchronize
 from warpslam.meshing import ObservedView, extract_mesh
 from warpslam.optimizers import PoseOptimizer, RowOptimizer
 from warpslam.rendering import RenderedImage
@@ -181,7 +181,7 @@ class Imap(Baseline):
         loss = float(batch.loss.numpy()[0]) / count
         return metres, loss if np.isfinite(loss) else np.inf, float(error), count / int((measured > 0).sum())
 
-    def _tracking_loss(self, wanted: Wanted | None = None, tape: Tape | None = None) -> None:
+    def _tracking_loss(self, wanted: Wanted | None = None, tape: wp.Tape | None = None) -> None:
         config, batch, bound = self.config.tracking, self._tracking, self._bound
         edges = {"edge_u": config.ignore_edge_u, "edge_v": config.ignore_edge_v}
         batch.draw(self._images.arrays, self._slot_of_frame, batch.capacity, self.intrinsics, **edges)

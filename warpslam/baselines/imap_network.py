@@ -13,7 +13,7 @@ from warpslam.decoders import EMBEDDING_SCALE
 from warpslam.field import RayBatch
 from warpslam.kernels import density, imap, rays
 from warpslam.kernels.grid import Vec32
-from warpslam.launching import Launcher, Step, Tape, run_slices
+from warpslam.launching import Launcher, Step, run_slices
 
 _CHUNK = 256  # points whose weight gradients a thread sums
 _IN_BLOCKS = (imap.EMBEDDING_BLOCKS, imap.BLOCKS, imap.BLOCKS, imap.BLOCKS)
@@ -146,7 +146,7 @@ class ImapBatch(RayBatch):
         network: ImapNetwork,
         bound: Bound,
         wanted: Wanted | None = None,
-        tape: Tape | None = None,
+        tape: wp.Tape | None = None,
         *,
         use_depth: bool = True,
         jitter: bool = False,
