@@ -154,7 +154,7 @@ def test_mapper_and_tracker_leave_each_other_alone(frames, monkeypatch, optimize
 
 
 def test_map_is_at_most_one_task_behind(frames, gated):
-    """The frame that is to be mapped next waits until the one before is in the map."""
+    """The frame that is to be mapped next is not even tracked before the last one is in the map."""
     slam, gate = gated
     for frame in frames[1:4]:
         step(slam, frame)
@@ -162,6 +162,7 @@ def test_map_is_at_most_one_task_behind(frames, gated):
     waiting.start()
     waiting.join(0.5)
     assert waiting.is_alive() and gate.frames == [2] and slam._scheduler.version == 1
+    assert len(slam.trajectory.poses) == 4
     gate.open.set()
     waiting.join(WAIT)
     assert not waiting.is_alive() and slam._scheduler.version == 2

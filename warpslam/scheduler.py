@@ -3,18 +3,22 @@
 A schedule is handed the frames to map and hands back what came of them:
 
     start(task, keyframes)      map a frame; nothing else is under way
-    has_finished                something is there to be taken over
+    is_busy                     a task was not taken over yet
+    has_finished                it can be, without waiting
     finished(wait)              the outcome of the last task, once: from then on it is in the map that the tracker reads
 
 `Strict` maps within `start`, so that a run repeats to the bit. `Overlapped` maps beside the frames that follow. Its
 mapper has a map of its own, copied from the tracker's once; when a task is taken over, between two tracked frames, the
 rows that the task changed are copied to the tracker's map, and the version of that map goes up by one. The mapper also
 has its own images and its own copies of the keyframes, so that nothing is shared while both run. A task can't start
-before the one before it was taken over: at most one is missing from the map that a frame is tracked against.
+before the one before it was taken over: at most one is missing from the map that a frame is tracked against, and none
+from that of a frame that is to be mapped, because the map would inherit the error of its pose. So a run that maps every
+n-th frame has n - 1 frames to hide a task behind, and one that maps every frame gains nothing.
 """
 
 from __future__ import annotations
 
+import contextvars
 import logging
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -66,6 +70,10 @@ class Scheduler(Protocol):
     """What `warpslam.slam.Slam` asks of a schedule."""
 
     @property
+    def is_busy(self) -> bool:
+        """Whether there is a task whose outcome was not taken over."""
+
+    @property
     def has_finished(self) -> bool:
         """Whether there is an outcome to take over without waiting; a failure is one."""
 
@@ -91,6 +99,11 @@ class Strict:
     def __init__(self, mapper: Mapper, images: ImagePool) -> None:
         self.mapper, self.images = mapper, images
         self._finished: tuple[int, MappingResult] | None = None
+
+    @property
+    def is_busy(self) -> bool:
+        """See `Scheduler`."""
+        return self._finished is not None
 
     @property
     def has_finished(self) -> bool:
@@ -121,6 +134,11 @@ class Overlapped:
         self._beside = _Stream(mapper.device) if mapper.device.is_cuda else _Thread()
         self._working: tuple[SceneMap, ImagePool] | None = None
         self._under_way: _UnderWay | None = None
+
+    @property
+    def is_busy(self) -> bool:
+        """See `Scheduler`."""
+        return self._under_way is not None
 
     @property
     def has_finished(self) -> bool:
@@ -199,7 +217,8 @@ class _Thread:
 
     def start(self, work: Callable[[], Callable[[], MappingResult]]) -> None:
         self._executor = ThreadPoolExecutor(1, thread_name_prefix=THREAD_NAME)
-        self._future = self._executor.submit(lambda: work()())
+        # The context tells a profile which phase the work belongs to.
+        self._future = self._executor.submit(contextvars.copy_context().run, lambda: work()())
 
     def result(self) -> MappingResult:
         try:

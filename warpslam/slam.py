@@ -150,9 +150,11 @@ class Slam:
 
         timings: dict[str, float] = {}
         losses: dict[str, float] = {}
-        if self._scheduler.has_finished:
+        is_due = index % self.config.mapping.every == 0
+        # A frame that is to be mapped is tracked against all that was mapped before it.
+        if self._scheduler.has_finished or (is_due and self._scheduler.is_busy):
             with _timed(timings, "mapping", self.device):
-                losses.update(self._take_over())
+                losses.update(self._take_over(wait=True))
         self._images.set(0, rgb, depth)
         self._current = index
         status, message, inliers, depth_error = "OK", "", 1.0, 0.0
@@ -175,7 +177,7 @@ class Slam:
 
         if status == "OK" and self.config.mapping.enabled:
             keyframe = self._is_keyframe(index)
-            if first or index % self.config.mapping.every == 0:
+            if first or is_due:
                 with _timed(timings, "mapping", self.device):
                     losses.update(self._map(index, depth, first))
             if keyframe:
@@ -245,13 +247,12 @@ class Slam:
         return self._tracker.explained_share(config.known_error) < config.known_share
 
     def _map(self, index: int, depth: np.ndarray, first: bool) -> dict[str, float]:
-        """Have a frame mapped, after the one before; returns the losses of what is done by now."""
-        losses = self._take_over(wait=True)
+        """Have a frame mapped; returns the losses if it is done by now."""
         vector = self._vectors[index]
         extent = measured_extent(depth, pose_from_vector(vector), self.intrinsics)
         self._scheduler.start(MappingTask("first" if first else "frame", index, vector, extent), self.keyframes)
         self._seen.append(SeenDepth.of(index, depth))
-        return {**losses, **self._take_over(wait=first)}
+        return self._take_over(wait=first)
 
     def _take_over(self, *, wait: bool = False) -> dict[str, float]:
         """What the mapper has finished since: the map, the poses it refined, and its losses, which are returned."""
