@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warpslam.camera import Intrinsics, check_transform, pose_from_vector, vector_from_pose
+from warpslam.camera import Intrinsics, check_number, check_transform, pose_from_vector, vector_from_pose
 from warpslam.config import Config
 from warpslam.decoders import Decoders, load_decoders
-from warpslam.errors import InputError
+from warpslam.errors import ConfigError, FrameError, InputError
+from warpslam.frames import read_images
 from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth
 from warpslam.launching import compile_kernels, synchronize
 from warpslam.mapper import Mapper
@@ -25,8 +27,6 @@ from warpslam.trajectory import Trajectory
 
 if TYPE_CHECKING:
     import trimesh
-
-MIN_DEPTH_PIXELS = 100
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Slam:
     ) -> None:
         self.intrinsics = intrinsics
         self.config = config if config is not None else Config()
-        _check_image_size(intrinsics, self.config)
+        _check_settings(intrinsics, self.config)
         self.device = wp.get_device(device)
         self.seed = seed
         self.compile_seconds = compile_kernels(self.device)
@@ -117,20 +117,27 @@ class Slam:
             missing.
             timestamp: Time [s]; frame number / 30 by default.
             T_world_camera: Known pose (4, 4): used for the first frame (identity by default), and for every frame with
-                `TrackingConfig.use_given_poses`.
+                `TrackingConfig.use_given_poses`. One that is not finite counts as unknown.
             depth_scale: Units per metre of integer depth, for example 1000 or 5000.
 
+        A bad frame raises nothing: arrays of another size or type, too few pixels with depth, a black or over-exposed
+        image, a time that is not finite, or a pose that is not finite where one is needed give the status SKIPPED and
+        a message, and leave the map as it was.
+
         Raises:
-            InputError: an array has the wrong shape or type, or a pose is needed and not given.
+            InputError: misuse, which no other frame would mend: an argument that is no array, integer depth without
+                ``depth_scale``, a T_world_camera that is no rigid transform, or none where one is needed.
         """
         index = len(self._vectors)
-        timestamp = index / 30.0 if timestamp is None else float(timestamp)
-        rgb, depth = self._read_images(rgb, depth, depth_scale)
-        given = None if T_world_camera is None else check_transform(T_world_camera)
+        timestamp = index / 30.0 if timestamp is None else check_number(timestamp, "timestamp")
+        given = None if T_world_camera is None else check_transform(T_world_camera, unknown_is_nan=True)
         if self.config.tracking.use_given_poses and given is None:
             raise InputError(f"frame {index}: tracking.use_given_poses is on, but step() got no T_world_camera")
-        if np.count_nonzero(depth) < MIN_DEPTH_PIXELS:
-            return self._skip(index, timestamp, f"fewer than {MIN_DEPTH_PIXELS} pixels have depth")
+        try:
+            rgb, depth = self._read_images(rgb, depth, depth_scale)
+            given = self._check_frame(timestamp, given)
+        except FrameError as error:
+            return self._skip(index, timestamp, str(error))
 
         self._images.set(0, rgb, depth)
         self._current = index
@@ -214,8 +221,6 @@ class Slam:
             return True
         if config.policy == "interval":
             return index - self.keyframes[-1].index >= config.every
-        if self.config.tracking.use_given_poses:
-            raise InputError("keyframes.policy = information_gain needs tracking; use interval with given poses")
         return self._tracker.explained_share(config.known_error) < config.known_share
 
     def _map(self, index: int, depth: np.ndarray, first: bool) -> dict[str, float]:
@@ -314,30 +319,31 @@ class Slam:
 
     def _skip(self, index: int, timestamp: float, message: str) -> FrameResult:
         vector = self._vectors[-1].copy() if self._vectors else vector_from_pose(np.eye(4))
+        if not math.isfinite(timestamp):
+            timestamp = self._timestamps[-1] if self._timestamps else 0.0
         self._append(vector, timestamp, "SKIPPED")
         return FrameResult(index, timestamp, pose_from_vector(vector), "SKIPPED", inliers=0.0, message=message)
 
     def _read_images(self, rgb: Any, depth: Any, depth_scale: float | None) -> tuple[np.ndarray, np.ndarray]:
-        """uint8 (H, W, 3) and float32 (H, W) [m] with 0 for everything that is no measurement."""
-        rgb, depth = _to_numpy(rgb), _to_numpy(depth)
-        size = (self.intrinsics.height, self.intrinsics.width)
-        if rgb.shape != (*size, 3):
-            raise InputError(f"rgb has shape {rgb.shape}, expected {(*size, 3)} from the intrinsics")
-        if depth.shape != size:
-            raise InputError(f"depth has shape {depth.shape}, expected {size} from the intrinsics")
-        if np.issubdtype(rgb.dtype, np.floating):
-            rgb = np.rint(np.clip(np.nan_to_num(rgb), 0.0, 1.0) * 255.0).astype(np.uint8)
-        elif rgb.dtype != np.uint8:
-            raise InputError(f"rgb has dtype {rgb.dtype}, expected uint8 or float in [0, 1]")
-        if np.issubdtype(depth.dtype, np.integer):
-            if depth_scale is None or not depth_scale > 0:
-                raise InputError(f"depth is {depth.dtype}: pass depth_scale, the units per metre (for example 1000)")
-            depth = depth / np.float32(depth_scale)
-        elif not np.issubdtype(depth.dtype, np.floating):
-            raise InputError(f"depth has dtype {depth.dtype}, expected float [m] or uint16 with depth_scale")
-        depth = depth.astype(np.float32)
-        usable = np.isfinite(depth) & (depth > 0) & (depth <= self.config.grid.max_depth)
-        return rgb, np.where(usable, depth, np.float32(0.0))
+        config = self.config
+        return read_images(
+            rgb,
+            depth,
+            (self.intrinsics.height, self.intrinsics.width),
+            depth_scale=depth_scale,
+            max_depth=config.grid.max_depth,
+            colored=config.tracking.color_weight > 0 or config.mapping.color_weight > 0,
+        )
+
+    def _check_frame(self, timestamp: float, given: np.ndarray | None) -> np.ndarray | None:
+        """The given pose if it is known; `FrameError` if it is needed and not known, or the time is no time."""
+        if not math.isfinite(timestamp):
+            raise FrameError(f"its timestamp is {timestamp}")
+        if given is None or np.isfinite(given).all():
+            return given
+        if self.config.tracking.use_given_poses:
+            raise FrameError("its T_world_camera holds NaN or infinity, and tracking.use_given_poses is on")
+        return None
 
 
 class _timed:
@@ -354,20 +360,12 @@ class _timed:
         self.timings[self.name] = self.timings.get(self.name, 0.0) + time.perf_counter() - self.start
 
 
-def _to_numpy(array: Any) -> np.ndarray:
-    if isinstance(array, np.ndarray):
-        return array
-    if isinstance(array, wp.array):
-        return array.numpy()
-    if hasattr(array, "detach"):
-        return array.detach().cpu().numpy()
-    raise InputError(f"expected a NumPy, torch or Warp array, got {type(array).__name__}")
-
-
-def _check_image_size(camera: Intrinsics, config: Config) -> None:
+def _check_settings(camera: Intrinsics, config: Config) -> None:
     tracking = config.tracking
     if camera.width <= 2 * tracking.ignore_edge_u or camera.height <= 2 * tracking.ignore_edge_v:
         raise InputError(
             f"tracking.ignore_edge_u = {tracking.ignore_edge_u} and ignore_edge_v = {tracking.ignore_edge_v} "
             f"leave nothing of a {camera.width} x {camera.height} image: lower them"
         )
+    if tracking.use_given_poses and config.keyframes.policy == "information_gain":
+        raise ConfigError("keyframes.policy = information_gain needs tracking; use interval with given poses")
