@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warpslam.checking import ERROR, OK, check_sequence
 from warpslam.errors import ConfigError, DatasetError, InputError, MeshError
 from warpslam.evaluation import (
     AteResult,
@@ -26,6 +28,7 @@ from warpslam.evaluation import (
     rpe,
     write_tum,
 )
+from warpslam.output import LogFile, kernel_cache_errors, output_error
 from warpslam.run_folder import RunFolder, Source, write_json
 
 if TYPE_CHECKING:
@@ -87,6 +90,7 @@ def run(
     source: Source | None = None,
     truth_mesh: trimesh.Trimesh | None = None,
     on_frame: Callable[[Progress], None] | None = None,
+    check_input: bool = True,
 ) -> RunResult:
     """Run SLAM over a sequence and write a run folder.
 
@@ -100,14 +104,18 @@ def run(
         source: How to open ``sequence`` again, for `warpslam render`.
         truth_mesh: True surface in the world frame of the sequence; adds the reconstruction metrics.
         on_frame: Called after each frame.
+        check_input: Refuse an input that `warpslam.checking` finds can't work; its warnings are logged in any case.
 
     Raises:
-        WarpSlamError: The input or a setting can't be used. metrics.json is written even so.
+        WarpSlamError: The input or a setting can't be used, or a result can't be written. metrics.json is written even
+            so, where it can be.
     """
     selected = _select(sequence, frames)
     folder = RunFolder.create(output, sequence.name)
     with _log_file(folder.log):
-        return _Run(sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame).execute()
+        run_ = _Run(sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame)
+        run_.check_input = check_input
+        return run_.execute()
 
 
 class _Run:
@@ -131,6 +139,8 @@ class _Run:
         self.truth_poses: list[np.ndarray] = []
         self.results: list[FrameResult] = []
         self.unreadable_count = 0
+        self.unusable: list[dict[str, Any]] = []  # frames that were left out or skipped, and why
+        self.check_input = True
         self.seconds: dict[str, float] = defaultdict(float)
         self.ate: AteResult | None = None
         self.reconstruction: ReconstructionResult | None = None
@@ -141,6 +151,7 @@ class _Run:
         try:
             try:
                 self._write_input()
+                self._check_input()
                 self._build_slam()
                 self._process_frames()
                 self._finish_map()
@@ -156,17 +167,15 @@ class _Run:
                 self._draw_plots()
         except KeyboardInterrupt:
             self.status = "interrupted"
+        except OSError as error:
+            self._fail(error)
+            raise output_error(error, self.folder.path) from error
         except Exception as error:
-            self.status = "failed"
-            self.metrics["error"] = f"{type(error).__name__}: {error}"
-            log.exception("the run failed")
-            if self.results and not self.folder.trajectory.exists():
-                self._write_trajectory()
+            self._fail(error)
             raise
         finally:
             self.seconds["total"] = time.perf_counter() - start
-            self._write_timing()
-            self._write_metrics()
+            self._write_figures()
         return RunResult(self.folder, self.status, self.metrics, self.ate, self.reconstruction)
 
     def _write_input(self) -> None:
@@ -175,8 +184,60 @@ class _Run:
             self.folder.write_source(self.source)
         log.info("%s: %d of %d frames, %s", self.sequence.name, len(self.selected), len(self.sequence), self.selected)
 
+    def _check_input(self) -> None:
+        tracking = self.config.tracking
+        if tracking.use_given_poses and self.sequence.ground_truth() is None and self._first_pose() is None:
+            raise ConfigError(f"tracking.use_given_poses is on, but {self.sequence.name} has no poses; switch it off")
+        with self._clock("checking"):
+            findings = check_sequence(
+                self.sequence,
+                self.selected,
+                max_depth=self.config.grid.max_depth,
+                poses_matter=tracking.use_given_poses,
+            )
+        bad = [finding for finding in findings if finding.severity != OK]
+        self.metrics["input_checks"] = [vars(finding) for finding in bad]
+        for finding in bad:
+            log.warning("%s", finding)
+        errors = [str(finding) for finding in bad if finding.severity == ERROR]
+        if errors and self.check_input:
+            raise DatasetError(f"{self.sequence.name}: {'; '.join(errors)} (warpslam check tells more)")
+
+    def _first_pose(self) -> np.ndarray | None:
+        try:
+            return self.sequence[self.selected[0]].T_world_camera
+        except DatasetError:
+            return None
+
+    def _fail(self, error: Exception) -> None:
+        """Note the failure, and save the trajectory if that has not happened yet."""
+        self.status = "failed"
+        self.metrics["error"] = f"{type(error).__name__}: {error}"
+        log.exception("the run failed")
+        for leftover in self.folder.path.glob("*.part*"):
+            # Half a map may be what filled the disk.
+            leftover.unlink(missing_ok=True)
+        if self.results and not self.folder.trajectory.exists():
+            try:
+                self._write_trajectory()
+            except OSError:
+                rescued = Path(tempfile.mkdtemp(prefix=f"warpslam_{self.folder.path.name}_")) / "trajectory.tum"
+                trajectory, count = self._trajectory()
+                write_tum(rescued, trajectory.timestamps[:count], trajectory.poses[:count])
+                log.error("%s can't be written: the trajectory so far is in %s", self.folder.trajectory, rescued)
+
+    def _write_figures(self) -> None:
+        try:
+            self._write_metrics()
+            self._write_timing()
+        except OSError as error:
+            if self.status != "failed":
+                self.status = "failed"
+                raise output_error(error, self.folder.path) from error
+            log.error("%s", output_error(error, self.folder.path))
+
     def _build_slam(self) -> None:
-        with self._clock("setup"):
+        with self._clock("setup"), kernel_cache_errors():
             self.slam = build_slam(self.sequence.intrinsics, self.config, self.device, self.seed)
         self.seconds["kernel_compile"] = self.slam.compile_seconds
 
@@ -190,24 +251,37 @@ class _Run:
                     T_world_camera = None
                 self.frame_indices.append(frame.index)
                 self.truth_poses.append(np.full((4, 4), np.nan) if T_world_camera is None else T_world_camera)
+                if T_world_camera is None and self.config.tracking.use_given_poses:
+                    T_world_camera = self.truth_poses[-1]  # NaN: this frame will be skipped, and the run goes on
                 result = self.slam.step(
                     frame.rgb, frame.depth, timestamp=frame.timestamp, T_world_camera=T_world_camera
                 )
                 self.results.append(result)
                 level = logging.INFO if result.status == "OK" else logging.WARNING
                 log.log(level, "frame %d: %s", frame.index, _describe(result))
+                if result.status == "SKIPPED":
+                    self.unusable.append({"frame": frame.index, "status": "SKIPPED", "reason": result.message})
                 if self.on_frame is not None:
                     self.on_frame(self._progress(result, time.perf_counter() - start))
         if not self.results:
             raise DatasetError(f"{self.sequence.name}: none of the {len(self.selected)} selected frames can be read")
+        if all(result.status == "SKIPPED" for result in self.results):
+            reason = self.unusable[-1]["reason"]
+            raise DatasetError(f"{self.sequence.name}: none of the {len(self.results)} frames can be used: {reason}")
 
     def _readable_frames(self) -> Iterator[Frame]:
+        last = self.results[-1].timestamp if self.results else -np.inf
         for index in self.selected:
             try:
                 with self._clock("reading"):
                     frame = self.sequence[index]
+                # Against the frame before, whatever became of it: a single wrong time costs one frame, not the rest.
+                before, last = last, frame.timestamp
+                if last <= before:
+                    raise DatasetError(f"its time {last:.6f} s is not after {before:.6f} s, that of the frame before")
             except DatasetError as error:
                 self.unreadable_count += 1
+                self.unusable.append({"frame": index, "status": "unreadable", "reason": str(error)})
                 log.warning("frame %d left out: %s", index, error)
                 continue
             yield frame
@@ -236,7 +310,9 @@ class _Run:
 
     def _write_trajectory(self) -> None:
         trajectory, count = self._trajectory()
-        write_tum(self.folder.trajectory, trajectory.timestamps[:count], trajectory.poses[:count])
+        partial = self.folder.trajectory.with_name("trajectory.tum.partial")
+        write_tum(partial, trajectory.timestamps[:count], trajectory.poses[:count])
+        partial.replace(self.folder.trajectory)
         if self._has_truth():
             write_tum(self.folder.ground_truth, trajectory.timestamps[:count], np.array(self.truth_poses)[:count])
 
@@ -279,12 +355,14 @@ class _Run:
         truth = np.array(self.truth_poses)[:count]
         known = np.isfinite(truth).all(axis=(1, 2))
         poses = np.where(known[:, None, None], truth, trajectory.poses[:count])
+        used = [p for p, result in enumerate(self.results[:count]) if result.status != "SKIPPED"]
+        indices = [self.frame_indices[p] for p in used]
         try:
             with self._clock("evaluation"):
                 self.reconstruction = evaluate_mesh(
-                    self.folder.mesh, self.truth_mesh, self.sequence, self.frame_indices[:count], poses, seed=self.seed
+                    self.folder.mesh, self.truth_mesh, self.sequence, indices, poses[used], seed=self.seed
                 )
-        except MeshError as error:
+        except (MeshError, DatasetError) as error:
             log.error("no reconstruction metrics: %s", error)
             self.metrics["reconstruction"] = {"error": str(error)}
             return
@@ -303,6 +381,8 @@ class _Run:
                 plot_top_view(self.folder.top_view, poses, None, status)
             plot_error(self.folder.error_plot, trajectory.timestamps[:count], self.ate, self._losses(count), status)
         panels = self._render_panels(poses)
+        if not panels:
+            return
         with self._clock("plotting"):
             plot_panels(self.folder.panels, panels)
         self.metrics["rendering"] = {
@@ -321,10 +401,15 @@ class _Run:
 
     def _render_panels(self, poses: np.ndarray) -> list[Panel]:
         assert self.slam is not None
-        positions = np.unique(np.linspace(0, len(poses) - 1, PANEL_COUNT).round().astype(int))
+        usable = [p for p, result in enumerate(self.results[: len(poses)]) if result.status != "SKIPPED"]
+        positions = [usable[i] for i in np.unique(np.linspace(0, len(usable) - 1, PANEL_COUNT).round().astype(int))]
         # Small images tell as much in the figure, and rendering is slow without a GPU.
         stride = -(-self.sequence.intrinsics.width // PANEL_WIDTH)
-        frames = [self.sequence[self.frame_indices[p]] for p in positions]
+        try:
+            frames = [self.sequence[self.frame_indices[p]] for p in positions]
+        except DatasetError as error:
+            log.error("no panels: %s", error)
+            return []
         with self._clock("rendering"):
             pairs = zip(frames, positions, strict=True)
             return [render_panel(self.slam, frame, poses[p], stride) for frame, p in pairs]
@@ -366,6 +451,7 @@ class _Run:
                 "unreadable": self.unreadable_count,
                 **{status: statuses.get(status, 0) for status in ("OK", "LOST", "SKIPPED")},
             },
+            "unusable_frames": self.unusable,
             "seconds": {
                 "total": self.seconds["total"],
                 "kernel_compile": self.seconds["kernel_compile"],
@@ -554,7 +640,7 @@ def _peak_memory_mib() -> float | None:
 def _log_file(path: Path) -> Iterator[None]:
     """Send everything that warpslam logs, from INFO up, to a file as well."""
     logger = logging.getLogger("warpslam")
-    handler = logging.FileHandler(path, mode="w", encoding="utf-8")
+    handler = LogFile(path, logger)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     level = logger.level
     logger.addHandler(handler)

@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import os
+import tempfile
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -85,8 +86,11 @@ class RunFolder:
             if (folder / "metrics.json").exists():
                 for file in _WRITTEN_FILES:
                     (folder / file).unlink(missing_ok=True)
+            # Now, not after an hour of work: a folder that is there need not be one that can be written to.
+            with tempfile.TemporaryFile(dir=folder) as probe:
+                probe.write(bytes(4096))
         except OSError as error:
-            raise ConfigError(f"output folder {folder} can't be used ({error.strerror}); choose another one") from error
+            raise ConfigError(f"output folder {folder} can't be used ({error.strerror or error}); choose another one") from error
         if path is None:
             _point_latest(folder)
         return cls(folder)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 
 from warpslam import __version__
-from warpslam.cli import evaluate, info, mesh, render, run
+from warpslam.cli import check, evaluate, info, mesh, render, run
 from warpslam.cli.common import EXIT_ERROR, EXIT_INTERRUPTED
 from warpslam.errors import WarpSlamError
 
-COMMANDS = (run, evaluate, render, mesh, info)
+COMMANDS = (run, check, evaluate, render, mesh, info)
 """Modules with a function ``add(commands)``, in the order of ``warpslam --help``."""
 
 
@@ -29,6 +30,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.debug:
             raise
         print(f"warpslam: {error}", file=sys.stderr)
+        return EXIT_ERROR
+    except BrokenPipeError:  # the reader of our output has gone, as in "| head"
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_ERROR
+    except OSError as error:
+        if options.debug:
+            raise
+        print(f"warpslam: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
         return EXIT_ERROR
     except KeyboardInterrupt:
         print("warpslam: interrupted", file=sys.stderr)

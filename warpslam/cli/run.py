@@ -40,6 +40,7 @@ def add(commands: Any) -> None:
     run.add_argument("--preset", help="settings to start from (default: the dataset's)")
     run.add_argument("--frames", type=parse_frames, metavar="A:B:STEP", help="frames to use, as in a Python slice")
     run.add_argument("--truth-mesh", metavar="FILE", help="true surface, for the reconstruction metrics")
+    run.add_argument("--no-check", action="store_true", help="run even if the checks of the input find an error")
     add_run_options(run)
 
     demo = add_command(commands, "demo", _demo, "SLAM in a small rendered room; needs no data")
@@ -57,7 +58,15 @@ def _run(options: argparse.Namespace) -> int:
     sequence = open_source(source)
     config = Config.from_preset(options.preset or sequence.preset, options.overrides)
     truth_mesh = load_mesh(options.truth_mesh) if options.truth_mesh else None
-    return _execute(sequence, config, source, options, frames=options.frames, truth_mesh=truth_mesh)
+    return _execute(
+        sequence,
+        config,
+        source,
+        options,
+        frames=options.frames,
+        truth_mesh=truth_mesh,
+        check_input=not options.no_check,
+    )
 
 
 def _demo(options: argparse.Namespace) -> int:

@@ -29,6 +29,7 @@ class FileSequence(RgbdSequence):
         poses: Camera-to-world transforms, OpenCV axes, shape (N, 4, 4), NaN where unknown, or None.
         timestamps: Times [s], shape (N,); index / 30 if None.
         color_size_may_differ: Resize colour to the size of the depth image instead of refusing another size.
+        remarks: What was left out in making the list of frames, for `warpslam check`.
 
     Raises:
         DatasetError: If the counts differ, or the first frame can't be read or does not fit the camera.
@@ -44,6 +45,7 @@ class FileSequence(RgbdSequence):
         poses: np.ndarray | None = None,
         timestamps: np.ndarray | None = None,
         color_size_may_differ: bool = False,
+        remarks: Sequence[str] = (),
     ) -> None:
         if len(rgb_files) != len(depth_files):
             raise DatasetError(
@@ -64,6 +66,7 @@ class FileSequence(RgbdSequence):
         self._rgb_files, self._depth_files = list(rgb_files), list(depth_files)
         self._poses = None if poses is None or np.isnan(poses).all() else poses
         self._color_size_may_differ = color_size_may_differ
+        self.remarks = tuple(remarks)
         # A camera that does not fit the images is found now rather than after a run has begun.
         self._load(0)
 
@@ -84,6 +87,10 @@ class FileSequence(RgbdSequence):
     def ground_truth(self) -> np.ndarray | None:
         """All poses, float64, shape (N, 4, 4), NaN where unknown; None if the sequence has none."""
         return None if self._poses is None else self._poses.copy()
+
+    def files(self, index: int) -> tuple[Path, Path]:
+        """Colour and depth file of a frame."""
+        return self._rgb_files[index], self._depth_files[index]
 
     def read_depth_metres(self, path: Path) -> np.ndarray:
         """Stored depth image in metres, float32, shape (H, W), 0 = missing."""
