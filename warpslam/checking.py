@@ -270,9 +270,7 @@ def _check_depth(sequence: RgbdSequence, frames: list[Frame], max_depth: float) 
         ]  # fmt: skip
         if fitting:
             options = " or ".join(f"{known:g}" for known in fitting)
-            remedy = (
-                f"a depth_scale of {options} would suit a room: --camera {_camera_text(sequence, fitting[0])}"
-            )
+            remedy = f"a depth_scale of {options} would suit a room: --camera {_camera_text(sequence, fitting[0])}"
         unit = "" if scale is None else f" with {scale:g} stored units per metre"
         severity = ERROR if beyond > 0.9 else WARNING
         message = f"median depth is {median:.3g} m{unit}, {beyond:.0%} lies beyond {max_depth:g} m"
@@ -325,9 +323,7 @@ def _check_poses(sequence: RgbdSequence, frames: Sequence[int], poses_matter: bo
     yield _check_convention(sequence, frames, truth, poses_matter)
 
 
-def _check_convention(
-    sequence: RgbdSequence, frames: Sequence[int], truth: np.ndarray, poses_matter: bool
-) -> Finding:
+def _check_convention(sequence: RgbdSequence, frames: Sequence[int], truth: np.ndarray, poses_matter: bool) -> Finding:
     pairs = []
     for i, j in moving_pairs(truth, 6):
         try:

@@ -29,6 +29,10 @@ class OutputError(WarpSlamError):
     """A result can't be written: the disk is full, or the folder can't be written to."""
 
 
+class MemoryBudgetError(WarpSlamError):
+    """A run takes more memory than it was allowed to."""
+
+
 class MeshError(WarpSlamError):
     """There is no surface to extract, or a mesh file can't be used."""
 

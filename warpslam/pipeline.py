@@ -482,7 +482,7 @@ def build_slam(intrinsics: Intrinsics, config: Config, device: str | None, seed:
     """
     from warpslam.slam import Slam
 
-    _check_device(device)
+    check_device(device)
     return Slam(intrinsics, config=config, device=device, seed=seed)
 
 
@@ -497,11 +497,12 @@ def load_slam(folder: RunFolder, device: str | None = None) -> Slam:
     from warpslam.slam import Slam
 
     path = folder.require(folder.map, "the run stopped before it had a map")
-    _check_device(device)
+    check_device(device)
     return Slam.load(path, device=device)
 
 
-def _check_device(device: str | None) -> None:
+def check_device(device: str | None) -> None:
+    """Raise `ConfigError` if there is no such Warp device."""
     import warp as wp
 
     names = [str(known) for known in wp.get_devices()]

@@ -8,11 +8,11 @@ import sys
 from collections.abc import Sequence
 
 from warpslam import __version__
-from warpslam.cli import check, evaluate, info, mesh, render, run
+from warpslam.cli import batch, check, evaluate, info, mesh, render, run
 from warpslam.cli.common import EXIT_ERROR, EXIT_INTERRUPTED
 from warpslam.errors import WarpSlamError
 
-COMMANDS = (run, check, evaluate, render, mesh, info)
+COMMANDS = (run, batch, check, evaluate, render, mesh, info)
 """Modules with a function ``add(commands)``, in the order of ``warpslam --help``."""
 
 

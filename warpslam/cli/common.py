@@ -23,7 +23,7 @@ def add_command(commands: Any, name: str, function: Callable[[argparse.Namespace
     return parser
 
 
-def add_run_options(parser: argparse.ArgumentParser) -> None:
+def add_run_options(parser: argparse.ArgumentParser, output: str = "run folder (default: runs/NAME/TIME)") -> None:
     """Options of everything that runs SLAM."""
     parser.add_argument(
         "--set", dest="overrides", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
@@ -32,18 +32,18 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--decoders", metavar="FILE", help="decoder checkpoint (default: the package's own)")
     parser.add_argument("--device", help="cpu, cuda:0, ... (default: a GPU if there is one)")
     parser.add_argument("--seed", type=int, default=0, help="seed of every random choice (0)")
-    parser.add_argument("-o", "--output", metavar="DIR", help="run folder (default: runs/NAME/TIME)")
+    parser.add_argument("-o", "--output", metavar="DIR", help=output)
 
 
 def parse_frames(text: str) -> slice:
     """A slice of frames from A:B or A:B:STEP."""
+    from warpslam.batch import parse_slice
+    from warpslam.errors import ConfigError
+
     try:
-        parts = [int(part) if part.strip() else None for part in text.split(":")]
-    except ValueError:
-        parts = []
-    if not 2 <= len(parts) <= 3:
-        raise argparse.ArgumentTypeError(f"{text!r} is not A:B or A:B:STEP, for example 0:200 or ::2")
-    return slice(*parts)
+        return slice(*parse_slice(text))
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 @contextmanager
