@@ -142,7 +142,7 @@ def read_manifest(path: str | Path, common: Job) -> list[Job]:
     path = Path(path)
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+    except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: can't be read as yaml ({' '.join(str(error).split())})") from error
     if not isinstance(content, dict) or not isinstance(content.get("sequences"), list) or not content["sequences"]:
         raise ConfigError(f"{path}: expected a list 'sequences' of folders, and 'defaults' where wanted")

@@ -86,7 +86,11 @@ class Calibration:
     @classmethod
     def from_yaml(cls, path: Path) -> Calibration:
         """Read a ``camera.yaml``."""
-        return cls.from_fields(_load_yaml(path.read_bytes(), str(path)), str(path))
+        try:
+            text = path.read_bytes()
+        except OSError as error:
+            raise DatasetError(f"{path}: can't be read ({error.strerror}); correct or remove the file") from error
+        return cls.from_fields(_load_yaml(text, str(path)), str(path))
 
     @classmethod
     def from_text(cls, text: str) -> Calibration:
@@ -134,7 +138,7 @@ def _load_yaml(text: bytes, source: str) -> dict[str, Any]:
 
     try:
         fields = yaml.safe_load(text)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # it lets those of numbers and dates through
         raise DatasetError(
             f"{source}: not valid YAML ({' '.join(str(error).split())}); write one 'name: number' a line"
         ) from error

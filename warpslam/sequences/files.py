@@ -16,6 +16,7 @@ from warpslam.sequences.calibration import Calibration
 from warpslam.sequences.images import read_depth, read_rgb
 
 FRAME_RATE = 30.0
+_FIRST_FRAMES = 10
 
 
 class FileSequence(RgbdSequence):
@@ -32,7 +33,7 @@ class FileSequence(RgbdSequence):
         remarks: What was left out in making the list of frames, for `warpslam check`.
 
     Raises:
-        DatasetError: If the counts differ, or the first frame can't be read or does not fit the camera.
+        DatasetError: If the counts differ, or none of the first frames can be read and fits the camera.
     """
 
     def __init__(
@@ -67,8 +68,7 @@ class FileSequence(RgbdSequence):
         self._poses = None if poses is None or np.isnan(poses).all() else poses
         self._color_size_may_differ = color_size_may_differ
         self.remarks = tuple(remarks)
-        # A camera that does not fit the images is found now rather than after a run has begun.
-        self._load(0)
+        self._check_first_frames()
 
     def __len__(self) -> int:
         return len(self._rgb_files)
@@ -95,6 +95,20 @@ class FileSequence(RgbdSequence):
     def read_depth_metres(self, path: Path) -> np.ndarray:
         """Stored depth image in metres, float32, shape (H, W), 0 = missing."""
         return read_depth(path).astype(np.float32) / np.float32(self.calibration.depth_scale)
+
+    def _check_first_frames(self) -> None:
+        """A camera that does not fit the images is found now rather than after a run has begun; but a single bad frame
+        is none the worse for being the first.
+        """
+        first_error = None
+        for index in range(min(len(self), _FIRST_FRAMES)):
+            try:
+                self._load(index)
+                return
+            except DatasetError as error:
+                first_error = first_error or error
+        if first_error is not None:
+            raise first_error
 
     def _load(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         rgb, depth = read_rgb(self._rgb_files[index]), self.read_depth_metres(self._depth_files[index])
