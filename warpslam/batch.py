@@ -26,6 +26,7 @@ from warpslam.run_folder import RunFolder, as_file_name, read_json, write_json
 
 STATE_FILE = "batch.json"
 WORKER_LOG = "worker.log"
+WORKER_COMMAND = (sys.executable, "-m", "warpslam.batch_worker")
 FINISHED, FAILED, MEMORY, INTERRUPTED, CRASHED = "finished", "failed", "out of memory", "interrupted", "crashed"
 RUNNING, WAITING, SKIPPED = "running", "waiting", "done before"
 ENDED = (FINISHED, FAILED, MEMORY, INTERRUPTED, CRASHED, SKIPPED)
@@ -326,7 +327,7 @@ class _Coordinator:
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
         with open(folder / WORKER_LOG, "w", encoding="utf-8") as log_file:
             process = subprocess.Popen(
-                [sys.executable, "-m", "warpslam.batch_worker"],
+                WORKER_COMMAND,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log_file,

@@ -233,10 +233,10 @@ def _check_camera(sequence: RgbdSequence) -> Iterator[Finding]:
     remedy = f"give the camera of these images: --camera {_camera_text(sequence)} with the right numbers"
     across = np.degrees(2 * np.arctan(camera.width / (2 * camera.fx)))
     off = max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
-    if off >= 0.5:
+    if off >= 0.45:
         twice = abs(camera.cx / camera.width - 1) < 0.1 and abs(camera.cy / camera.height - 1) < 0.1
         why = " (they look like those of an image twice as large)" if twice else ""
-        yield Finding("camera", ERROR, f"the principal point is not inside the image: {text}{why}", remedy)
+        yield Finding("camera", ERROR, f"the principal point is not well inside the image: {text}{why}", remedy)
     elif off > _MAX_OFF_CENTRE:
         yield Finding("camera", WARNING, f"the principal point is far from the middle of the image: {text}", remedy)
     elif not _MIN_FIELD_OF_VIEW < across < _MAX_FIELD_OF_VIEW:
