@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warpslam import batch, cli
@@ -104,6 +104,17 @@ def test_updates_tell_the_story(tmp_path):
     assert {status.done for status in seen if status.name == "slow"} >= {1, 2, 3, 4}
 
 
+def test_kernels_are_compiled_once(tmp_path):
+    """The second worker starts when the first one has all kernels, not while it compiles them."""
+    running = {}
+    names = ("compiling", "good", "good2")
+    run_batch(
+        jobs(*names), tmp_path, workers=2,
+        on_update=lambda status: status.status == "running" and running.setdefault(status.name, time.monotonic()),
+    )  # fmt: skip
+    assert running["good"] - running["compiling"] > 0.5 > running["good2"] - running["good"]
+
+
 def test_interrupt_stops_workers_and_the_rest_waits(tmp_path):
     """Ctrl-C: the running job is told to write what it has, the next one is not started, and both go on later."""
     sent = []
@@ -159,7 +170,7 @@ def test_manifest(tmp_path):
         ("sequences: [a, {path: b, sed: 1}]", "entry 2: .*known fields are path"),
         ("sequences: [{path: b, seed: x}]", "seed = 'x'"),
         ("sequences: [{path: b, set: a=1}]", "set = 'a=1' must be a list"),
-        ("sequences:\n- path: b\n  frames: 0:20", "frames = 20 must be a text in quotes"),
+        ("sequences:\n- path: b\n  frames: 1:20", "frames = 80 must be a text in quotes"),
         ("sequences: [{path: b, frames: 'x'}]", "is not A:B"),
         ("sequences: [a]\nextra: 1", "unknown field extra"),
         ("a: b: c", "can't be read as yaml"),
@@ -173,6 +184,7 @@ def test_wrong_manifests(tmp_path, text, message):
         read_manifest(tmp_path / "m.yaml", COMMON)
 
 
+@settings(deadline=None, derandomize=True)
 @given(st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: st.lists(inner, max_size=3)
@@ -226,7 +238,8 @@ def test_command(tmp_path, capsys):
     options = ["--workers", "2", "-o", str(out)]
     assert cli.main(["batch", str(tmp_path / "good"), str(tmp_path / "broken"), *options]) == 1
     text = capsys.readouterr().out
-    assert "good: running  frame 4/4  2.00 fps" in text and "broken: failed  depth.png: truncated" in text
+    assert "good: running  frame 4/4  2.00 fps" in text
+    assert "broken: failed  frame 2/4  2.00 fps  ATE 1.00 cm  depth.png: truncated" in text
     assert "sequence" in text and "3.00" in text and str(out / "summary.html") in text
     assert cli.main(["batch", str(tmp_path / "good"), *options]) == 0
     assert "good: done before" in capsys.readouterr().out

@@ -172,7 +172,7 @@ def _with_fields(job: Job, fields: Any, path: Path, where: str) -> Job:
                 raise ConfigError(f"{path}: {where}: set = {value!r} must be a list of texts KEY=VALUE")
             values["overrides"] = (*job.overrides, *value)
         elif name == "frames":
-            # Unquoted, yaml reads 0:20 as a number in base 60.
+            # Unquoted, yaml reads 1:20 as a number in base 60.
             if not isinstance(value, str):
                 raise ConfigError(f"{path}: {where}: frames = {value!r} must be a text in quotes, such as '0:200'")
             values["frames"] = parse_slice(value)

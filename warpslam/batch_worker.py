@@ -33,7 +33,8 @@ def main() -> None:
     order = json.load(sys.stdin)
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, order["cores"])
-    os.environ["WARPSLAM_THREADS"] = str(len(order["cores"]))
+    # Where cores can't be pinned the count has to do; who set it before knows better.
+    os.environ.setdefault("WARPSLAM_THREADS", str(len(order["cores"])))
     handler = logging.StreamHandler()
     # The run folder's log.txt has the rest.
     handler.setLevel(logging.WARNING)

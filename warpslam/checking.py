@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from warpslam.errors import DatasetError, FrameError
-from warpslam.frames import exposure_fault, read_images
+from warpslam.images import exposure_fault, read_images
 from warpslam.pose_convention import CONVENTIONS, EXPECTED, DepthView, agreement, moving_pairs
 from warpslam.sequences.base import Frame, RgbdSequence
 from warpslam.sequences.files import FileSequence, frame_number
@@ -147,11 +147,8 @@ def _sample(sequence: RgbdSequence, index: int, max_depth: float) -> _Sample:
         frame = sequence[index]
     except DatasetError as error:
         return _Sample(index, None, str(error))
-    camera = sequence.intrinsics
     try:
-        read_images(
-            frame.rgb, frame.depth, (camera.height, camera.width), depth_scale=None, max_depth=np.inf, colored=False
-        )
+        read_images(frame.rgb, frame.depth, sequence.intrinsics, np.inf, colored=False)
     except FrameError as error:
         return _Sample(index, None, f"frame {index}: {error}")
     return _Sample(index, frame, None)

@@ -15,7 +15,7 @@ from warpslam.camera import Intrinsics, check_number, check_transform, pose_from
 from warpslam.config import Config
 from warpslam.decoders import Decoders, load_decoders
 from warpslam.errors import ConfigError, FrameError, InputError
-from warpslam.frames import read_images
+from warpslam.images import read_images
 from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth
 from warpslam.launching import compile_kernels, synchronize
 from warpslam.mapper import Mapper
@@ -326,13 +326,9 @@ class Slam:
 
     def _read_images(self, rgb: Any, depth: Any, depth_scale: float | None) -> tuple[np.ndarray, np.ndarray]:
         config = self.config
+        is_colored = config.tracking.color_weight > 0 or config.mapping.color_weight > 0
         return read_images(
-            rgb,
-            depth,
-            (self.intrinsics.height, self.intrinsics.width),
-            depth_scale=depth_scale,
-            max_depth=config.grid.max_depth,
-            colored=config.tracking.color_weight > 0 or config.mapping.color_weight > 0,
+            rgb, depth, self.intrinsics, config.grid.max_depth, depth_scale, colored=is_colored
         )
 
     def _check_frame(self, timestamp: float, given: np.ndarray | None) -> np.ndarray | None:

@@ -11,8 +11,9 @@ import numpy as np
 GARBAGE = (
     b"", b"\x00" * 40, b"\xff\xfe\xfd garbage \x80\x81", b"nan nan nan nan\n", b"1e999 -inf 0 0\n", b"<html>404</html>",
     b"[1, 2", b"{", b"a: &a [*a]\n", b"- 1\n- 2\n", b"0 0 0 0\n" * 5, b"1,2,3,4,5,6,7,8\n", b"# only a comment\n",
-    b"../../../etc/passwd 1\n", b"1.0 \n", b"-5 rgb/x.png\n", b"1 1 1 1 1 1 1 1 1 1 1 1 1 1 1 1\n", "\ufeff１ ２\n".encode(),
-    b"fx: 1e400\nfy: .inf\n", b"width: 99999999999999\n", b"!!python/object/apply:os.abort []\n", b"9" * 5000 + b"\n",
+    b"../../../etc/passwd 1\n", b"1.0 \n", b"-5 rgb/x.png\n", b"1 1 1 1 1 1 1 1 1 1 1 1 1 1 1 1\n",
+    "\ufeff１ ２\n".encode(), b"fx: 1e400\nfy: .inf\n", b"width: 99999999999999\n",
+    b"!!python/object/apply:os.abort []\n", b"9" * 5000 + b"\n",
 )  # fmt: skip
 
 Mutation = Callable[[Path, np.random.Generator], None]

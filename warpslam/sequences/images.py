@@ -115,10 +115,12 @@ def _decode(path: Path, flags: int) -> np.ndarray:
     is_cut_png = is_png and b"IEND" not in data[-64:]
     is_cut_jpeg = data.startswith(b"\xff\xd8") and b"\xff\xd9" not in data[-1024:]
     is_damaged = is_png and not _has_right_checksums(data)
-    try:
-        image = None if is_cut_png or is_cut_jpeg or is_damaged else cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
-    except cv2.error:
-        image = None
+    image = None
+    if not (is_cut_png or is_cut_jpeg or is_damaged):
+        try:
+            image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+        except cv2.error:
+            image = None
     if image is None:
         state = "truncated" if is_cut_png or is_cut_jpeg else "damaged or not an"
         raise DatasetError(f"{path}: {state} image ({len(data)} bytes); fetch the file again or remove the frame")

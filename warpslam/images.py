@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from warpslam.camera import check_number
+from warpslam.camera import Intrinsics, check_number
 from warpslam.errors import FrameError, InputError
 
 MIN_DEPTH_PIXELS = 100
@@ -22,16 +22,22 @@ DARKEST, BRIGHTEST = 2, 253
 
 
 def read_images(
-    rgb: Any, depth: Any, size: tuple[int, int], *, depth_scale: float | None, max_depth: float, colored: bool = True
+    rgb: Any,
+    depth: Any,
+    intrinsics: Intrinsics,
+    max_depth: float,
+    depth_scale: float | None = None,
+    *,
+    colored: bool = True,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Images of a frame in the form that the kernels take.
 
     Args:
         rgb: Colour (H, W, 3): uint8, or float in [0, 1]. NumPy, torch or Warp array.
         depth: z-depth (H, W): float [m], or integer with ``depth_scale``.
-        size: Height and width that the camera has.
-        depth_scale: Units per metre of integer depth.
+        intrinsics: Camera, for the size that the images should have.
         max_depth: Larger depth counts as missing [m].
+        depth_scale: Units per metre of integer depth.
         colored: Whether colour is used; if not, a black image is no fault.
 
     Returns:
@@ -42,6 +48,7 @@ def read_images(
         FrameError: This frame is no use; the message says why.
     """
     rgb, depth = _to_numpy(rgb, "rgb"), _to_numpy(depth, "depth")
+    size = (intrinsics.height, intrinsics.width)
     if depth_scale is not None:
         depth_scale = check_number(depth_scale, "depth_scale")
         if not (math.isfinite(depth_scale) and depth_scale > 0):
