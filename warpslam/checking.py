@@ -34,6 +34,7 @@ _MIN_FIELD_OF_VIEW, _MAX_FIELD_OF_VIEW = 25.0, 120.0  # [degree]
 _MAX_OFF_CENTRE = 0.2  # of the image, principal point
 _MAX_JUMP = 0.5  # [m] of the true pose from frame to frame
 _MAX_PAUSE = 1.0  # [s]
+_PAIR_COUNT = 6  # of frames that poses and depth are compared in
 _SURE = 0.85  # agreement of depth and poses beyond which nothing else is tried
 _NAMED = 3  # frames or files named in a message
 
@@ -132,7 +133,7 @@ def check_sequence(
     frames = range(len(sequence)) if frames is None else frames
     count = len(frames) if sample_count is None else min(sample_count, len(frames))
     chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
-    samples = [_sample(sequence, index, max_depth) for index in chosen]
+    samples = [_sample(sequence, index) for index in chosen]
     findings = [*_check_frames(samples), *_check_files(sequence, frames, thorough), *_check_times(sequence, frames)]
     good = [sample.frame for sample in samples if sample.frame is not None]
     findings += _check_camera(sequence)
@@ -142,7 +143,7 @@ def check_sequence(
     return findings
 
 
-def _sample(sequence: RgbdSequence, index: int, max_depth: float) -> _Sample:
+def _sample(sequence: RgbdSequence, index: int) -> _Sample:
     try:
         frame = sequence[index]
     except DatasetError as error:
@@ -321,8 +322,10 @@ def _check_poses(sequence: RgbdSequence, frames: Sequence[int], poses_matter: bo
 
 
 def _check_convention(sequence: RgbdSequence, frames: Sequence[int], truth: np.ndarray, poses_matter: bool) -> Finding:
-    pairs = []
-    for i, j in moving_pairs(truth, 6):
+    pairs: list[tuple[DepthView, DepthView]] = []
+    for i, j in moving_pairs(truth, 2 * _PAIR_COUNT):
+        if len(pairs) == _PAIR_COUNT:
+            break
         try:
             depths = [sequence[frames[k]].depth for k in (i, j)]
         except DatasetError:

@@ -114,7 +114,6 @@ def _metres(depth: np.ndarray, depth_scale: float | None, max_depth: float) -> n
     usable = np.isfinite(depth) & (depth > 0) & (depth <= max_depth)
     count = np.count_nonzero(usable)
     if count < MIN_DEPTH_PIXELS:
-        raise FrameError(
-            f"fewer than {MIN_DEPTH_PIXELS} pixels have depth within {max_depth:g} m (only {count} of {depth.size})"
-        )
+        within = f" within {max_depth:g} m" if math.isfinite(max_depth) else ""
+        raise FrameError(f"fewer than {MIN_DEPTH_PIXELS} pixels have depth{within} (only {count} of {depth.size})")
     return np.where(usable, depth, np.float32(0.0))
