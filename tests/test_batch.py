@@ -16,7 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from warpslam import batch, cli
-from warpslam.batch import BatchState, Job, JobStatus, read_manifest, run_batch, split_cores, with_free_names
+from warpslam.batch import BatchState, Job, JobStatus, run_batch, split_cores, with_free_names
+from warpslam.batch_manifest import FIELDS, read_manifest
 from warpslam.batch_summary import write_summary
 from warpslam.batch_worker import resident_bytes
 from warpslam.errors import ConfigError, WarpSlamError
@@ -188,7 +189,7 @@ def test_wrong_manifests(tmp_path, text, message):
 @given(st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: st.lists(inner, max_size=3)
-    | st.dictionaries(st.sampled_from([*batch._MANIFEST_FIELDS, "sequences", "defaults", "x"]), inner, max_size=4),
+    | st.dictionaries(st.sampled_from([*FIELDS, "sequences", "defaults", "x"]), inner, max_size=4),
     max_leaves=12,
 ))  # fmt: skip
 def test_any_manifest_is_read_or_refused(tmp_path_factory, content):

@@ -95,7 +95,7 @@ def agreement(
         close = np.abs(z[ahead][inside] - measured) < TOLERANCE * measured
         agreeing += np.count_nonzero(close & valid)
         # Points that leave the image prove nothing, but a convention that throws nearly all out has not won.
-        compared += max(np.count_nonzero(valid), MIN_OVERLAP * len(points))
+        compared += max(float(np.count_nonzero(valid)), MIN_OVERLAP * len(points))
     return agreeing / compared if compared else 0.0
 
 

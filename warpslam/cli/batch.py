@@ -68,7 +68,8 @@ def _batch(options: argparse.Namespace) -> int:
 
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
-    from warpslam.batch import Job, read_manifest, with_free_names
+    from warpslam.batch import Job, with_free_names
+    from warpslam.batch_manifest import read_manifest
 
     frames = options.frames
     common = Job(

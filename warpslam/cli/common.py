@@ -37,7 +37,7 @@ def add_run_options(parser: argparse.ArgumentParser, output: str = "run folder (
 
 def parse_frames(text: str) -> slice:
     """A slice of frames from A:B or A:B:STEP."""
-    from warpslam.batch import parse_slice
+    from warpslam.batch_manifest import parse_slice
     from warpslam.errors import ConfigError
 
     try:
