@@ -1,6 +1,9 @@
 """Settings: validation, presets, overrides, yaml."""
 
 import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from warpslam.config import PRESETS, Config
 from warpslam.errors import ConfigError
@@ -56,3 +59,80 @@ def test_unusable_yaml_is_a_config_error_with_the_file(tmp_path, text):
     path.write_text(text)
     with pytest.raises(ConfigError, match="broken.yaml"):
         Config.load(path)
+
+
+# The same examples on every machine, however busy it is.
+seeded = settings(deadline=None, derandomize=True)
+GROUPS = [name for name in Config.model_fields if name != "decoders"]
+FIELDS = [f"{group}.{name}" for group in GROUPS for name in type(getattr(Config(), group)).model_fields]
+anything = st.one_of(
+    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=6), st.lists(st.integers(), max_size=2)
+)
+
+
+def numbers(config):
+    return [v for group in config.model_dump().values() if isinstance(group, dict) for v in group.values()]
+
+
+@seeded
+@given(st.lists(st.tuples(st.sampled_from(FIELDS), anything), max_size=4))
+def test_any_setting_is_taken_or_refused_by_name(tmp_path_factory, changes):
+    """A value of any kind gives finite settings that survive a file, or an error that names the field."""
+    values: dict = {}
+    for field, value in changes:
+        group, name = field.split(".")
+        values.setdefault(group, {})[name] = value
+    try:
+        config = Config.from_dict(values)
+    except ConfigError as error:
+        assert any(field in str(error) for field, _ in changes)
+        return
+    assert all(abs(value) < float("inf") for value in numbers(config) if isinstance(value, float))
+    path = tmp_path_factory.mktemp("config") / "config.yaml"
+    config.save(path)
+    assert Config.load(path) == config
+
+
+@seeded
+@given(st.one_of(
+    st.text(max_size=30),
+    st.builds("{}={}".format, st.sampled_from([*FIELDS, "x", "mapping", "."]), st.text(max_size=12)),
+))  # fmt: skip
+def test_any_override_is_taken_or_refused(text):
+    """Whatever stands behind --set."""
+    try:
+        assert isinstance(Config.from_preset("default", [text]), Config)
+    except ConfigError:
+        pass
+
+
+@seeded
+@given(st.one_of(st.binary(max_size=60), st.recursive(anything, lambda inner: st.dictionaries(
+    st.sampled_from([*GROUPS, "iterations", "decoders"]), inner, max_size=3), max_leaves=6,
+).map(lambda value: yaml.safe_dump(value).encode())))  # fmt: skip
+def test_any_file_is_settings_or_refused(tmp_path_factory, data):
+    """Binary rubbish and well-formed yaml of any shape."""
+    path = tmp_path_factory.mktemp("config") / "config.yaml"
+    path.write_bytes(data)
+    try:
+        assert isinstance(Config.load(path), Config)
+    except ConfigError as error:
+        assert "config.yaml" in str(error)
+
+
+@pytest.mark.parametrize("value", [".nan", ".inf", "-.inf", "1e999"])
+@pytest.mark.parametrize("field", ["meshing.level_set", "grid.max_depth", "tracking.learning_rate"])
+def test_settings_are_finite(field, value):
+    """NaN and infinity are no settings."""
+    with pytest.raises(ConfigError, match=field):
+        Config.from_preset("default", [f"{field}={value}"])
+
+
+@pytest.mark.parametrize("text", ["9" * 5000, "[" * 3000, "{a: 2020-99-99}", "!!python/object/apply:os.abort []"])
+def test_yaml_that_breaks_the_parser(tmp_path, text):
+    """Errors that the yaml package lets through are settings errors too."""
+    (tmp_path / "broken.yaml").write_text(text)
+    with pytest.raises(ConfigError, match="broken.yaml"):
+        Config.load(tmp_path / "broken.yaml")
+    with pytest.raises(ConfigError):
+        Config.from_preset("default", [f"mapping.pixels={text}"])

@@ -1,6 +1,7 @@
 """The whole engine on a few small frames of a synthetic room."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import warp as wp
 from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.decoders import load_decoders
-from warpslam.errors import CheckpointError, InputError
+from warpslam.errors import CheckpointError, ConfigError, InputError
 from warpslam.images import read_images
 from warpslam.slam import Slam
 from warpslam.synthetic import SyntheticSequence
@@ -192,23 +193,107 @@ def test_arrays_of_any_kind_give_the_same_result(frames):
 
 
 def test_misuse_is_refused(frames):
-    """Wrong shapes and types, integer depth without a scale, a pose that is none."""
+    """What no other frame would mend: no array, integer depth without a scale, a pose that is none."""
     slam, frame = new_slam(), frames[0]
-    for rgb, depth, match in [
-        (frame.rgb[:10], frame.depth, "rgb has shape"),
-        (frame.rgb, frame.depth[:10], "depth has shape"),
-        (frame.rgb.astype(np.int32), frame.depth, "rgb has dtype"),
-        (frame.rgb, (frame.depth * 1000).astype(np.uint16), "depth_scale"),
-        (frame.rgb.tolist(), frame.depth, "list"),
+    units = (frame.depth * 1000).astype(np.uint16)
+    for arguments, match in [
+        ({"depth": units}, "pass depth_scale"),
+        ({"depth": units, "depth_scale": -1.0}, "depth_scale = -1.0"),
+        ({"depth": units, "depth_scale": "mm"}, "depth_scale = 'mm'"),
+        ({"rgb": frame.rgb.tolist()}, "rgb: expected .* list"),
+        ({"depth": None}, "depth: expected .* NoneType"),
+        ({"timestamp": "now"}, "timestamp = 'now'"),
+        ({"T_world_camera": np.zeros((4, 4))}, "rotation"),
+        ({"T_world_camera": np.eye(3)}, r"shape \(3, 3\)"),
+        ({"T_world_camera": [["a"]]}, "no matrix of numbers"),
     ]:
         with pytest.raises(InputError, match=match):
-            slam.step(rgb, depth)
-    with pytest.raises(InputError, match="rotation"):
-        slam.step(frame.rgb, frame.depth, T_world_camera=np.zeros((4, 4)))
+            slam.step(**{"rgb": frame.rgb, "depth": frame.depth, **arguments})
+    assert len(slam.trajectory.poses) == 0
     with pytest.raises(InputError, match="empty"):
         slam.render(np.eye(4))
+
+
+def test_settings_that_can_not_work_are_refused(frames):
+    """Edges wider than the image, and information gain without tracking, before any frame."""
     with pytest.raises(InputError, match="ignore_edge"):
         Slam(dataclasses.replace(CAMERA, width=8), Config())
+    with pytest.raises(ConfigError, match="keyframes.policy"):
+        new_slam("tracking.use_given_poses=true", "keyframes.policy=information_gain")
+
+
+def bad_frames(frame):
+    """Name of a fault, the frame that has it, and what the message says."""
+    rgb, depth = frame.rgb, frame.depth
+    few = np.zeros_like(depth)
+    few.flat[:99] = 1.0
+    return {
+        "size_of_rgb": ({"rgb": rgb[:10]}, "rgb has shape"),
+        "size_of_depth": ({"depth": depth[:10]}, "depth has shape"),
+        "depth_with_a_third_axis": ({"depth": depth[..., None]}, "depth has shape"),
+        "gray": ({"rgb": rgb[..., 0]}, "rgb has shape"),
+        "integer_rgb": ({"rgb": rgb.astype(np.int32)}, "rgb has dtype int32"),
+        "object_rgb": ({"rgb": rgb.astype(object)}, "rgb has dtype object"),
+        "object_depth": ({"depth": depth.astype(object)}, "depth has dtype object"),
+        "text_depth": ({"depth": np.full(depth.shape, "far")}, "depth has dtype <U3"),
+        "complex_depth": ({"depth": depth.astype(complex)}, "depth has dtype complex"),
+        "empty": ({"rgb": np.zeros((0, 0, 3), np.uint8)}, "rgb has shape"),
+        "no_depth": ({"depth": np.zeros_like(depth)}, "fewer than 100"),
+        "nan_depth": ({"depth": np.full_like(depth, np.nan)}, "fewer than 100"),
+        "infinite_depth": ({"depth": np.full_like(depth, np.inf)}, "fewer than 100"),
+        "negative_depth": ({"depth": -depth}, "fewer than 100"),
+        "far_depth": ({"depth": np.full(depth.shape, 1e300)}, "within 10 m"),
+        "little_depth": ({"depth": few}, "only 99"),
+        "black": ({"rgb": np.zeros_like(rgb)}, "black"),
+        "nan_rgb": ({"rgb": np.full(rgb.shape, np.nan)}, "black"),
+        "over_exposed": ({"rgb": np.full_like(rgb, 255)}, "over-exposed"),
+        "rgb_of_another_range": ({"rgb": rgb.astype(np.float32)}, r"expected \[0, 1\]"),
+        "torch_type_without_numpy": ({"depth": torch.tensor(depth).bfloat16()}, "no counterpart in NumPy"),
+        "sparse": ({"depth": torch.tensor(depth).to_sparse()}, "no counterpart in NumPy"),
+        "time": ({"timestamp": np.nan}, "timestamp is nan"),
+    }
+
+
+def test_bad_frames_are_skipped_and_nothing_is_lost(frames):
+    """Each fault gives SKIPPED with its reason and leaves the map alone; what comes after equals a run without them."""
+    good, slam = run(frames[:3]), run(frames[:2])
+    features = slam.scene.grids["middle"].features.numpy().copy()
+    faults = bad_frames(frames[2])
+    for name, (arguments, message) in faults.items():
+        result = slam.step(**{"rgb": frames[2].rgb, "depth": frames[2].depth, "timestamp": 0.05, **arguments})
+        assert result.status == "SKIPPED" and re.search(message, result.message), f"{name}: {result}"
+        assert np.isfinite(result.timestamp)
+    np.testing.assert_array_equal(slam.scene.grids["middle"].features.numpy(), features)
+    assert slam.trajectory.status == ["OK", "OK"] + ["SKIPPED"] * len(faults)
+    np.testing.assert_array_equal(slam.trajectory.poses[:2], good.trajectory.poses[:2])
+    assert slam.step(frames[2].rgb, frames[2].depth, frames[2].timestamp).status == "OK"
+
+
+def test_bad_frames_before_the_first_good_one(frames):
+    """The map starts with the first frame that can be used, at the pose given with it."""
+    slam = new_slam()
+    for arguments, _ in bad_frames(frames[0]).values():
+        slam.step(**{"rgb": frames[0].rgb, "depth": frames[0].depth, **arguments})
+    assert slam.scene.is_empty
+    result = slam.step(frames[1].rgb, frames[1].depth, T_world_camera=frames[1].T_world_camera)
+    assert result.status == "OK"
+    np.testing.assert_allclose(result.T_world_camera, frames[1].T_world_camera, atol=1e-6)
+
+
+def test_unknown_pose_where_one_is_needed(frames):
+    """A pose of NaN skips the frame with use_given_poses, and counts as none otherwise."""
+    unknown = np.full((4, 4), np.nan)
+    slam = run(frames[:1], "tracking.use_given_poses=true")
+    result = slam.step(frames[1].rgb, frames[1].depth, T_world_camera=unknown)
+    assert result.status == "SKIPPED" and "use_given_poses" in result.message
+    result = new_slam().step(frames[0].rgb, frames[0].depth, T_world_camera=unknown)
+    assert result.status == "OK" and np.allclose(result.T_world_camera, np.eye(4))
+
+
+def test_black_images_are_fine_where_colour_does_not_count(frames):
+    """With both colour weights at zero, depth alone is tracked and mapped."""
+    slam = new_slam("tracking.color_weight=0", "mapping.color_weight=0")
+    assert slam.step(np.zeros_like(frames[0].rgb), frames[0].depth).status == "OK"
 
 
 def test_saved_state_goes_on_exactly(frames, tmp_path):

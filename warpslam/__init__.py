@@ -13,6 +13,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from warpslam.camera import Intrinsics as Intrinsics
+    from warpslam.checking import check_folder as check_folder
     from warpslam.config import PRESETS as PRESETS
     from warpslam.config import Config as Config
     from warpslam.decoders import Decoders as Decoders
@@ -20,10 +21,13 @@ if TYPE_CHECKING:
     from warpslam.errors import CheckpointError as CheckpointError
     from warpslam.errors import ConfigError as ConfigError
     from warpslam.errors import DatasetError as DatasetError
+    from warpslam.errors import FrameError as FrameError
     from warpslam.errors import InputError as InputError
     from warpslam.errors import MapSizeError as MapSizeError
+    from warpslam.errors import MemoryBudgetError as MemoryBudgetError
     from warpslam.errors import MeshError as MeshError
     from warpslam.errors import MissingDependencyError as MissingDependencyError
+    from warpslam.errors import OutputError as OutputError
     from warpslam.errors import WarpSlamError as WarpSlamError
     from warpslam.evaluation import ate as ate
     from warpslam.evaluation import rpe as rpe
@@ -43,12 +47,15 @@ _MODULE_OF = {
     "DatasetError": "warpslam.errors",
     "Decoders": "warpslam.decoders",
     "Frame": "warpslam.sequences.base",
+    "FrameError": "warpslam.errors",
     "FrameResult": "warpslam.slam",
     "InputError": "warpslam.errors",
     "Intrinsics": "warpslam.camera",
     "MapSizeError": "warpslam.errors",
+    "MemoryBudgetError": "warpslam.errors",
     "MeshError": "warpslam.errors",
     "MissingDependencyError": "warpslam.errors",
+    "OutputError": "warpslam.errors",
     "PRESETS": "warpslam.config",
     "RenderedImage": "warpslam.slam",
     "RgbdSequence": "warpslam.sequences.base",
@@ -56,6 +63,7 @@ _MODULE_OF = {
     "Trajectory": "warpslam.slam",
     "WarpSlamError": "warpslam.errors",
     "ate": "warpslam.evaluation",
+    "check_folder": "warpslam.checking",
     "load_decoders": "warpslam.decoders",
     "open_sequence": "warpslam.sequences",
     "profile": "warpslam.profiling",

@@ -57,12 +57,28 @@ class Intrinsics:
         )
 
 
-def check_transform(T: np.ndarray, name: str = "T_world_camera") -> np.ndarray:
-    """Return ``T`` as a float64 (4, 4) rigid transform or raise `InputError`."""
-    T = np.asarray(T, dtype=np.float64)
+def check_number(value: float, name: str) -> float:
+    """Return ``value`` as a float, NaN and infinity included, or raise `InputError`."""
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{name} = {value!r} is no number") from error
+
+
+def check_transform(T: np.ndarray, name: str = "T_world_camera", *, unknown_is_nan: bool = False) -> np.ndarray:
+    """Return ``T`` as a float64 (4, 4) rigid transform or raise `InputError`.
+
+    unknown_is_nan: A matrix that is not finite stands for an unknown pose and is returned as it is.
+    """
+    try:
+        T = np.asarray(T, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is no matrix of numbers ({error})") from error
     if T.shape != (4, 4):
         raise InputError(f"{name} has shape {T.shape}, expected (4, 4)")
     if not np.isfinite(T).all():
+        if unknown_is_nan:
+            return T
         raise InputError(f"{name} holds NaN or infinity")
     R = T[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:

@@ -15,7 +15,7 @@ from warpslam.errors import ConfigError
 
 
 class _Group(BaseModel):
-    model_config = ConfigDict(extra="forbid", validate_assignment=True)
+    model_config = ConfigDict(extra="forbid", validate_assignment=True, allow_inf_nan=False)
 
 
 class GridConfig(_Group):
@@ -280,7 +280,7 @@ class Config(_Group):
         """
         try:
             values = yaml.safe_load(Path(path).read_text())
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
             raise ConfigError(f"{path}: can't be read as yaml: {error}") from None
         if not isinstance(values, dict):
             raise ConfigError(f"{path}: expected a mapping of groups, found {type(values).__name__}")
@@ -305,7 +305,7 @@ def _parse_override(text: str) -> dict[str, Any]:
         raise ConfigError(f"--set {text!r}: expected group.field=value, for example mapping.iterations=30")
     try:
         parsed: Any = yaml.safe_load(value)
-    except yaml.YAMLError:
+    except (yaml.YAMLError, ValueError, RecursionError):
         raise ConfigError(f"--set {text!r}: the value can't be parsed") from None
     # yaml reads 1e-3 as a string.
     if isinstance(parsed, str):

@@ -25,6 +25,18 @@ class InputError(WarpSlamError, ValueError):
     """An argument of the Python API has the wrong shape, type or range."""
 
 
+class FrameError(InputError):
+    """One frame can't be used; a run leaves it out and goes on."""
+
+
+class OutputError(WarpSlamError):
+    """A result can't be written: the disk is full, or the folder can't be written to."""
+
+
+class MemoryBudgetError(WarpSlamError):
+    """A run takes more memory than it was allowed to."""
+
+
 class MeshError(WarpSlamError):
     """There is no surface to extract, or a mesh file can't be used."""
 

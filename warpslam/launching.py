@@ -17,6 +17,7 @@ from typing import Any
 
 import warp as wp
 
+from warpslam.errors import ConfigError
 from warpslam.kernels import decoder
 
 MAX_SLICES = 8
@@ -31,9 +32,19 @@ def slice_count(device: wp.Device) -> int:
     """
     if device.is_cuda:
         return 1
-    return max(
-        1, min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, MAX_SLICES)
-    )
+    return max(1, min(_core_count(), MAX_SLICES))
+
+
+@lru_cache(maxsize=1)
+def _core_count() -> int:
+    """Cores that this process may use; fewer where several share a machine and WARPSLAM_THREADS says so."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    text = os.environ.get("WARPSLAM_THREADS", "")
+    if not text:
+        return cores
+    if not text.isdecimal() or int(text) < 1:
+        raise ConfigError(f"environment variable WARPSLAM_THREADS = {text!r} must be a whole number from 1 on")
+    return min(cores, int(text))
 
 
 @lru_cache(maxsize=1)

@@ -8,6 +8,7 @@ import logging
 import os
 import platform
 import sys
+import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warpslam.checking import ERROR, OK, check_sequence
 from warpslam.errors import ConfigError, DatasetError, InputError, MeshError, WarpSlamError
 from warpslam.evaluation import (
     DEFAULT_PROTOCOL,
@@ -35,6 +37,7 @@ from warpslam.evaluation import (
     write_tum,
 )
 from warpslam.method import DEFAULT_METHOD, build_method, load_method
+from warpslam.output import LogFile, kernel_cache_errors, output_error
 from warpslam.resume import (
     RunProgress,
     RunRequest,
@@ -112,6 +115,7 @@ def run(
     map_path: str | Path | None = None,
     localize_only: bool = False,
     saved: SavedRun | None = None,
+    check_input: bool = True,
 ) -> RunResult:
     """Run SLAM over a sequence and write a run folder.
 
@@ -134,9 +138,11 @@ def run(
         map_path: Map to start from, a file that `Slam.save` wrote; the first frame is looked for in it.
         localize_only: The map is left as it is.
         saved: Checkpoint of the run in ``output``, which goes on from there; all else must be as it was.
+        check_input: Refuse an input that `warpslam.checking` finds can't work; its warnings are logged in any case.
 
     Raises:
-        WarpSlamError: The input or a setting can't be used. metrics.json is written even so.
+        WarpSlamError: The input or a setting can't be used, or a result can't be written. metrics.json is written even
+            so, where it can be.
     """
     selected = select_frames(sequence, frames)
     _check_checkpoint_settings(checkpoint_every, map_path, localize_only, method)
@@ -165,7 +171,7 @@ def run(
         run_ = _Run(
             sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame, on_module, method, given
         )
-        run_.request, run_.checkpoint_every = request, checkpoint_every
+        run_.request, run_.checkpoint_every, run_.check_input = request, checkpoint_every, check_input
         if saved is not None:
             run_.go_on_from(saved)
         return run_.execute()
@@ -199,6 +205,7 @@ class _Run:
         self.truth_poses: list[np.ndarray] = []
         self.results: list[FrameResult] = []
         self.left_out: list[dict[str, Any]] = []
+        self.check_input = True
         self.seconds: dict[str, float] = defaultdict(float)
         self.request: RunRequest | None = None
         self.checkpoint_every: int | None = None
@@ -227,6 +234,7 @@ class _Run:
         try:
             try:
                 self._write_input()
+                self._check_input()
                 self._build_slam()
                 self._process_frames()
                 self._finish_map()
@@ -246,19 +254,15 @@ class _Run:
                 remove_checkpoints(self.folder)
         except KeyboardInterrupt:
             self.status = "interrupted"
+        except OSError as error:
+            self._fail(error)
+            raise output_error(error, self.folder.path) from error
         except Exception as error:
-            self.status = "failed"
-            self.metrics["error"] = f"{type(error).__name__}: {error}"
-            log.exception("the run failed")
-            if self.results and not self.folder.trajectory.exists():
-                self._write_trajectory()
+            self._fail(error)
             raise
         finally:
             self.seconds["total"] += time.perf_counter() - self.start
-            self._write_timing()
-            self._write_frame_records()
-            self._write_metrics()
-            self._write_report()
+            self._write_figures()
         return RunResult(self.folder, self.status, self.metrics, self.ate, self.reconstruction)
 
     def _write_input(self) -> None:
@@ -267,9 +271,71 @@ class _Run:
             self.folder.write_source(self.source)
         log.info("%s: %d of %d frames, %s", self.sequence.name, len(self.selected), len(self.sequence), self.selected)
 
+    def _check_input(self) -> None:
+        tracking = self.config.tracking
+        if tracking.use_given_poses and self.sequence.ground_truth() is None and self._first_pose() is None:
+            raise ConfigError(f"tracking.use_given_poses is on, but {self.sequence.name} has no poses; switch it off")
+        with self._clock("checking"):
+            findings = check_sequence(
+                self.sequence,
+                self.selected,
+                max_depth=self.config.grid.max_depth,
+                poses_matter=tracking.use_given_poses,
+            )
+        bad = [finding for finding in findings if finding.severity != OK]
+        self.metrics["input_checks"] = [vars(finding) for finding in bad]
+        for finding in bad:
+            log.warning("%s", finding)
+        errors = [str(finding) for finding in bad if finding.severity == ERROR]
+        if errors and self.check_input:
+            raise DatasetError(f"{self.sequence.name}: {'; '.join(errors)} (warpslam check tells more)")
+
+    def _first_pose(self) -> np.ndarray | None:
+        try:
+            return self.sequence[self.selected[0]].T_world_camera
+        except DatasetError:
+            return None
+
+    def _fail(self, error: Exception) -> None:
+        """Note the failure, and save the trajectory if that has not happened yet."""
+        self.status = "failed"
+        self.metrics["error"] = f"{type(error).__name__}: {error}"
+        log.exception("the run failed")
+        for leftover in self.folder.path.glob("*.part*"):
+            # Half a map may be what filled the disk.
+            leftover.unlink(missing_ok=True)
+        if self.results and not self.folder.trajectory.exists():
+            try:
+                self._write_trajectory()
+            except OSError:
+                rescued = Path(tempfile.mkdtemp(prefix=f"warpslam_{self.folder.path.name}_")) / "trajectory.tum"
+                trajectory, count = self._trajectory()
+                write_tum(rescued, trajectory.timestamps[:count], trajectory.poses[:count])
+                log.error("%s can't be written: the trajectory so far is in %s", self.folder.trajectory, rescued)
+
+    def _unusable_frames(self) -> list[dict[str, Any]]:
+        """Frames that were left out or skipped, and why, in their order."""
+        frames = [{"frame": f["index"], "status": "unreadable", "reason": f["message"]} for f in self.left_out]
+        for index, result in zip(self.frame_indices, self.results, strict=False):
+            if result.status == "SKIPPED":
+                frames.append({"frame": index, "status": "SKIPPED", "reason": result.message})
+        return sorted(frames, key=lambda frame: frame["frame"])
+
+    def _write_figures(self) -> None:
+        try:
+            self._write_metrics()
+            self._write_timing()
+            self._write_frame_records()
+            self._write_report()
+        except OSError as error:
+            if self.status != "failed":
+                self.status = "failed"
+                raise output_error(error, self.folder.path) from error
+            log.error("%s", output_error(error, self.folder.path))
+
     def _build_slam(self) -> None:
         request = self.request
-        with self._clock("setup"):
+        with self._clock("setup"), kernel_cache_errors():
             with self._clock("kernel_compile"):
                 self.modules = load_kernels(self.sequence, self.device, self.on_module)
             if self.saved is not None:
@@ -301,6 +367,8 @@ class _Run:
                 else:
                     # The world of a map that was loaded need not be that of the sequence's true poses.
                     given = T_world_camera if self._knows_poses() else None
+                if given is None and self.config.tracking.use_given_poses:
+                    given = self.truth_poses[-1]  # NaN: this frame will be skipped, and the run goes on
                 result = self.slam.step(frame.rgb, frame.depth, timestamp=frame.timestamp, T_world_camera=given)
                 self.results.append(result)
                 level = logging.INFO if result.status == "OK" else logging.WARNING
@@ -310,13 +378,21 @@ class _Run:
                 self._after_frame(frame)
         if not self.results:
             raise DatasetError(f"{self.sequence.name}: none of the {len(self.selected)} selected frames can be read")
+        if all(result.status == "SKIPPED" for result in self.results):
+            reason = self.results[-1].message
+            raise DatasetError(f"{self.sequence.name}: none of the {len(self.results)} frames can be used: {reason}")
 
     def _readable_frames(self) -> Iterator[Frame]:
+        last = self.results[-1].timestamp if self.results else -np.inf
         for index in self.selected[self.position :]:
             self.position += 1
             try:
                 with self._clock("reading"):
                     frame = self.sequence[index]
+                # Against the frame before, whatever became of it: a single wrong time costs one frame, not the rest.
+                before, last = last, frame.timestamp
+                if last <= before:
+                    raise DatasetError(f"its time {last:.6f} s is not after {before:.6f} s, that of the frame before")
             except DatasetError as error:
                 self.left_out.append({"index": index, "message": str(error)})
                 log.warning("frame %d left out: %s", index, error)
@@ -393,7 +469,9 @@ class _Run:
 
     def _write_trajectory(self) -> None:
         trajectory, count = self._trajectory()
-        write_tum(self.folder.trajectory, trajectory.timestamps[:count], trajectory.poses[:count])
+        partial = self.folder.trajectory.with_name("trajectory.tum.partial")
+        write_tum(partial, trajectory.timestamps[:count], trajectory.poses[:count])
+        partial.replace(self.folder.trajectory)
         if self._has_truth():
             write_tum(self.folder.ground_truth, trajectory.timestamps[:count], np.array(self.truth_poses)[:count])
 
@@ -455,13 +533,14 @@ class _Run:
         truth = np.array(self.truth_poses)[:count]
         known = np.isfinite(truth).all(axis=(1, 2))
         poses = np.where(known[:, None, None], truth, trajectory.poses[:count])
+        used = [p for p, result in enumerate(self.results[:count]) if result.status != "SKIPPED"]
+        indices = [self.frame_indices[p] for p in used]
         try:
             with self._clock("evaluation"):
-                indices = self.frame_indices[:count]
                 results = evaluate_mesh(
-                    self.folder.mesh, self.truth_mesh, self.sequence, indices, poses, device=self.device
+                    self.folder.mesh, self.truth_mesh, self.sequence, indices, poses[used], device=self.device
                 )
-        except MeshError as error:
+        except (MeshError, DatasetError) as error:
             log.error("no reconstruction metrics: %s", error)
             self.metrics["reconstruction"] = {"error": str(error)}
             return
@@ -481,6 +560,8 @@ class _Run:
                 plot_top_view(self.folder.top_view, poses, None, status)
             plot_error(self.folder.error_plot, trajectory.timestamps[:count], self.ate, self._losses(count), status)
         panels = self._render_panels(poses)
+        if not panels:
+            return
         with self._clock("plotting"):
             plot_panels(self.folder.panels, panels)
             save_panels(self.folder.panel_images, panels)
@@ -496,10 +577,15 @@ class _Run:
 
     def _render_panels(self, poses: np.ndarray) -> list[Panel]:
         assert self.slam is not None
-        positions = np.unique(np.linspace(0, len(poses) - 1, PANEL_COUNT).round().astype(int))
+        usable = [p for p, result in enumerate(self.results[: len(poses)]) if result.status != "SKIPPED"]
+        positions = [usable[i] for i in np.unique(np.linspace(0, len(usable) - 1, PANEL_COUNT).round().astype(int))]
         # Small images tell as much in the figure, and rendering is slow without a GPU.
         stride = -(-self.sequence.intrinsics.width // PANEL_WIDTH)
-        frames = [self.sequence[self.frame_indices[p]] for p in positions]
+        try:
+            frames = [self.sequence[self.frame_indices[p]] for p in positions]
+        except DatasetError as error:
+            log.error("no panels: %s", error)
+            return []
         with self._clock("rendering"):
             pairs = zip(frames, positions, strict=True)
             return [render_panel(self.slam, frame, poses[p], stride) for frame, p in pairs]
@@ -575,6 +661,7 @@ class _Run:
                 "unreadable": len(self.left_out),
                 **{status: statuses.get(status, 0) for status in ("OK", "LOST", "SKIPPED")},
             },
+            "unusable_frames": self._unusable_frames(),
             "seconds": {
                 "total": self.seconds["total"],
                 "kernel_compile": self.seconds["kernel_compile"],
@@ -768,7 +855,7 @@ def _peak_memory_mib() -> float | None:
 def _log_file(path: Path, *, append: bool = False) -> Iterator[None]:
     """Send everything that warpslam logs, from INFO up, to a file as well."""
     logger = logging.getLogger("warpslam")
-    handler = logging.FileHandler(path, mode="a" if append else "w", encoding="utf-8")
+    handler = LogFile(path, logger, append=append)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     level = logger.level
     logger.addHandler(handler)

@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import os
+import tempfile
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
@@ -101,14 +102,18 @@ class RunFolder:
         Raises:
             ConfigError: The folder can't be made.
         """
-        folder = Path(path) if path is not None else _free_name(Path(root) / _as_file_name(name))
+        folder = Path(path) if path is not None else _free_name(Path(root) / as_file_name(name))
         try:
             folder.mkdir(parents=True, exist_ok=True)
             if any((folder / name).exists() for name in _MARKS_OF_A_RUN):
                 for file in _WRITTEN_FILES:
                     (folder / file).unlink(missing_ok=True)
+            # Now, not after an hour of work: a folder that is there need not be one that can be written to.
+            with tempfile.TemporaryFile(dir=folder) as probe:
+                probe.write(bytes(4096))
         except OSError as error:
-            raise ConfigError(f"output folder {folder} can't be used ({error.strerror}); choose another one") from error
+            reason = error.strerror or error
+            raise ConfigError(f"output folder {folder} can't be used ({reason}); choose another one") from error
         if path is None:
             _point_latest(folder)
         return cls(folder)
@@ -194,7 +199,8 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _as_file_name(name: str) -> str:
+def as_file_name(name: str) -> str:
+    """``name`` with everything replaced that does not belong into the name of a folder."""
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in name).strip(".") or "run"
 
 

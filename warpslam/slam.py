@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warpslam.camera import Intrinsics, check_transform, pose_from_vector, vector_from_pose
+from warpslam.camera import Intrinsics, check_number, check_transform, pose_from_vector, vector_from_pose
 from warpslam.compilation import compile_kernels
 from warpslam.complexity import field_flops, weight_count
 from warpslam.config import Config
 from warpslam.decoders import Decoders, load_decoders
-from warpslam.errors import InputError
+from warpslam.errors import ConfigError, FrameError, InputError
 from warpslam.frustum import measured_extent
 from warpslam.images import read_images
 from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth, check_window_fits
@@ -32,8 +33,6 @@ from warpslam.trajectory import Trajectory
 
 if TYPE_CHECKING:
     import trimesh
-
-MIN_DEPTH_PIXELS = 100
 
 
 @dataclass(frozen=True)
@@ -132,21 +131,29 @@ class Slam:
             missing.
             timestamp: Time [s]; frame number / 30 by default.
             T_world_camera: Known pose (4, 4): used for the first frame (identity by default), for the first after
-                `forget_pose`, and for every frame with `TrackingConfig.use_given_poses`.
+                `forget_pose`, and for every frame with `TrackingConfig.use_given_poses`. One that is not finite counts
+                as unknown.
             depth_scale: Units per metre of integer depth, for example 1000 or 5000.
 
+        A bad frame raises nothing: arrays of another size or type, too few pixels with depth, a black or over-exposed
+        image, a time that is not finite, or a pose that is not finite where one is needed give the status SKIPPED and
+        a message, and leave the map as it was.
+
         Raises:
-            InputError: an array has the wrong shape or type, or a pose is needed and not given.
+            InputError: misuse, which no other frame would mend: an argument that is no array, integer depth without
+                ``depth_scale``, a T_world_camera that is no rigid transform, or none where one is needed.
             MapSizeError: the map would outgrow the memory set for it.
         """
         index = len(self._vectors)
-        timestamp = index / 30.0 if timestamp is None else float(timestamp)
-        rgb, depth = read_images(rgb, depth, self.intrinsics, self.config.grid.max_depth, depth_scale)
-        given = None if T_world_camera is None else check_transform(T_world_camera)
+        timestamp = index / 30.0 if timestamp is None else check_number(timestamp, "timestamp")
+        given = None if T_world_camera is None else check_transform(T_world_camera, unknown_is_nan=True)
         if self.config.tracking.use_given_poses and given is None:
             raise InputError(f"frame {index}: tracking.use_given_poses is on, but step() got no T_world_camera")
-        if np.count_nonzero(depth) < MIN_DEPTH_PIXELS:
-            return self._skip(index, timestamp, f"fewer than {MIN_DEPTH_PIXELS} pixels have depth")
+        try:
+            rgb, depth = self._read_images(rgb, depth, depth_scale)
+            given = self._check_frame(timestamp, given)
+        except FrameError as error:
+            return self._skip(index, timestamp, str(error))
 
         timings: dict[str, float] = {}
         losses: dict[str, float] = {}
@@ -242,8 +249,6 @@ class Slam:
             return True
         if config.policy == "interval":
             return index - self.keyframes[-1].index >= config.every
-        if self.config.tracking.use_given_poses:
-            raise InputError("keyframes.policy = information_gain needs tracking; use interval with given poses")
         return self._tracker.explained_share(config.known_error) < config.known_share
 
     def _map(self, index: int, depth: np.ndarray, first: bool) -> dict[str, float]:
@@ -377,8 +382,27 @@ class Slam:
 
     def _skip(self, index: int, timestamp: float, message: str) -> FrameResult:
         pose = self._last_pose()
+        if not math.isfinite(timestamp):
+            timestamp = self._timestamps[-1] if self._timestamps else 0.0
         self._append(vector_from_pose(pose), timestamp, "SKIPPED")
         return FrameResult(index, timestamp, pose, "SKIPPED", inliers=0.0, message=message)
+
+    def _read_images(self, rgb: Any, depth: Any, depth_scale: float | None) -> tuple[np.ndarray, np.ndarray]:
+        config = self.config
+        is_colored = config.tracking.color_weight > 0 or config.mapping.color_weight > 0
+        return read_images(
+            rgb, depth, self.intrinsics, config.grid.max_depth, depth_scale, colored=is_colored
+        )
+
+    def _check_frame(self, timestamp: float, given: np.ndarray | None) -> np.ndarray | None:
+        """The given pose if it is known; `FrameError` if it is needed and not known, or the time is no time."""
+        if not math.isfinite(timestamp):
+            raise FrameError(f"its timestamp is {timestamp}")
+        if given is None or np.isfinite(given).all():
+            return given
+        if self.config.tracking.use_given_poses:
+            raise FrameError("its T_world_camera holds NaN or infinity, and tracking.use_given_poses is on")
+        return None
 
 
 class _timed:
@@ -405,3 +429,5 @@ def _check_settings(camera: Intrinsics, config: Config) -> None:
             f"tracking.ignore_edge_u = {tracking.ignore_edge_u} and ignore_edge_v = {tracking.ignore_edge_v} "
             f"leave nothing of a {camera.width} x {camera.height} image: lower them"
         )
+    if tracking.use_given_poses and config.keyframes.policy == "information_gain":
+        raise ConfigError("keyframes.policy = information_gain needs tracking; use interval with given poses")

@@ -84,8 +84,8 @@ def test_pose_count(tmp_path):
 @pytest.mark.parametrize("keep", [0, 0.5, 0.95])
 @pytest.mark.parametrize("name", ["frame000000.png", "depth000000.png"])
 def test_truncated_png(tmp_path, name, keep):
-    """An image that is empty or cut off."""
-    file = writers.write_replica(tmp_path) / "results" / name
+    """An image that is empty or cut off, and the only one."""
+    file = writers.write_replica(tmp_path, 1) / "results" / name
     data = file.read_bytes()
     file.write_bytes(data[: int(len(data) * keep)])
     refuse(tmp_path, re.escape(name), "empty file|truncated image", "fetch")
@@ -105,9 +105,19 @@ def test_truncated_jpeg(tmp_path):
         sequence[2]
 
 
+def test_first_frame_may_be_bad(tmp_path):
+    """A sequence whose first image is cut off opens; the frame is refused when it is asked for."""
+    file = writers.write_replica(tmp_path) / "results" / "depth000000.png"
+    file.write_bytes(file.read_bytes()[:-20])
+    sequence = open_sequence(tmp_path)
+    with pytest.raises(DatasetError, match=r"depth000000\.png: truncated"):
+        sequence[0]
+    assert sequence[1].depth.shape == (writers.HEIGHT, writers.WIDTH)
+
+
 def test_no_image_at_all(tmp_path):
     """A file that is named as an image and holds text."""
-    writers.write_replica(tmp_path)
+    writers.write_replica(tmp_path, 1)
     (tmp_path / "results" / "depth000000.png").write_text("<html>404</html>" * 10)
     refuse(tmp_path, r"depth000000\.png", "damaged or not an image")
 
@@ -123,14 +133,14 @@ def test_frame_that_vanished(tmp_path):
 @pytest.mark.parametrize("image", [np.zeros((16, 24), np.uint8), np.zeros((16, 24, 3), np.uint16)])
 def test_depth_of_wrong_kind(tmp_path, image):
     """Depth in 8 bits or in colour."""
-    writers.write_replica(tmp_path)
+    writers.write_replica(tmp_path, 1)
     assert cv2.imwrite(str(tmp_path / "results" / "depth000000.png"), image)
     refuse(tmp_path, r"depth000000\.png", "one-channel 16-bit")
 
 
 def test_size_does_not_match(tmp_path):
     """Images of another size than the camera's, depth and colour."""
-    folder = writers.write_replica(tmp_path)
+    folder = writers.write_replica(tmp_path, 1)
     refuse(
         folder,
         r"depth000000\.png: depth image is 24 x 16",
@@ -268,7 +278,7 @@ def test_malformed_pose_files(tmp_path):
 def test_damaged_exr(tmp_path):
     """Co-Fusion: a cut-off EXR, and one without the depth channel."""
     pytest.importorskip("OpenEXR", reason="the package openexr is not installed")
-    file = writers.write_cofusion(tmp_path) / "depth_noise/Depth0001.exr"
+    file = writers.write_cofusion(tmp_path, 1) / "depth_noise/Depth0001.exr"
     data = file.read_bytes()
     file.write_bytes(data[: len(data) // 2])
     refuse(tmp_path, r"Depth0001\.exr", "damaged EXR", camera=writers.CAMERA)

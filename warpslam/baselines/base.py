@@ -8,8 +8,9 @@ import numpy as np
 
 from warpslam.camera import Intrinsics, check_transform, pose_from_vector, vector_from_pose
 from warpslam.config import Config
+from warpslam.errors import FrameError
 from warpslam.images import read_images
-from warpslam.slam import MIN_DEPTH_PIXELS, FrameResult
+from warpslam.slam import FrameResult
 from warpslam.trajectory import Trajectory
 
 
@@ -49,10 +50,13 @@ class Baseline:
         """Take in one frame; arguments and errors are those of `Slam.step`."""
         index = len(self._vectors)
         timestamp = index / 30.0 if timestamp is None else float(timestamp)
-        rgb, depth = read_images(rgb, depth, self.intrinsics, self.config.grid.max_depth, depth_scale)
-        given = None if T_world_camera is None else check_transform(T_world_camera)
-        if np.count_nonzero(depth) < MIN_DEPTH_PIXELS:
-            return self._skip(index, timestamp, f"fewer than {MIN_DEPTH_PIXELS} pixels have depth")
+        given = None if T_world_camera is None else check_transform(T_world_camera, unknown_is_nan=True)
+        try:
+            rgb, depth = read_images(rgb, depth, self.intrinsics, self.config.grid.max_depth, depth_scale)
+            if given is not None and not np.isfinite(given).all():
+                raise FrameError("its T_world_camera holds NaN or infinity")
+        except FrameError as error:
+            return self._skip(index, timestamp, str(error))
         return self._step(index, timestamp, rgb, depth, given)
 
     def _step(

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import sys
 from collections.abc import Sequence
 
 from warpslam import __version__
-from warpslam.cli import evaluate, info, mesh, profile, render, report, run, warmup
+from warpslam.cli import batch, check, evaluate, info, mesh, profile, render, report, run, warmup
 from warpslam.cli.common import EXIT_ERROR, EXIT_INTERRUPTED
 from warpslam.errors import WarpSlamError
 
-COMMANDS = (run, evaluate, report, render, mesh, profile, warmup, info)
+COMMANDS = (run, batch, check, evaluate, report, render, mesh, profile, warmup, info)
 """Modules with a function ``add(commands)``, in the order of ``warpslam --help``."""
 
 
@@ -26,11 +27,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     options.command_line = shlex.join(["warpslam", *(sys.argv[1:] if arguments is None else arguments)])
     try:
-        return options.command(options)
+        code = options.command(options)
+        sys.stdout.flush()
+        return code
     except WarpSlamError as error:
         if options.debug:
             raise
         print(f"warpslam: {error}", file=sys.stderr)
+        return EXIT_ERROR
+    except BrokenPipeError:  # the reader of our output has gone, as in "| head"
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_ERROR
+    except OSError as error:
+        if options.debug:
+            raise
+        print(f"warpslam: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
         return EXIT_ERROR
     except KeyboardInterrupt:
         print("warpslam: interrupted", file=sys.stderr)

@@ -31,10 +31,10 @@ def add_sequence_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", type=parse_frames, metavar="A:B:STEP", help="frames to use, as in a Python slice")
 
 
-def add_run_options(parser: argparse.ArgumentParser) -> None:
+def add_run_options(parser: argparse.ArgumentParser, output: str = "run folder (default: runs/NAME/TIME)") -> None:
     """Options of everything that writes a run folder."""
     add_slam_options(parser)
-    parser.add_argument("-o", "--output", metavar="DIR", help="run folder (default: runs/NAME/TIME)")
+    parser.add_argument("-o", "--output", metavar="DIR", help=output)
 
 
 def add_slam_options(parser: argparse.ArgumentParser) -> None:
@@ -50,13 +50,13 @@ def add_slam_options(parser: argparse.ArgumentParser) -> None:
 
 def parse_frames(text: str) -> slice:
     """A slice of frames from A:B or A:B:STEP."""
+    from warpslam.batch_manifest import parse_slice
+    from warpslam.errors import ConfigError
+
     try:
-        parts = [int(part) if part.strip() else None for part in text.split(":")]
-    except ValueError:
-        parts = []
-    if not 2 <= len(parts) <= 3:
-        raise argparse.ArgumentTypeError(f"{text!r} is not A:B or A:B:STEP, for example 0:200 or ::2")
-    return slice(*parts)
+        return slice(*parse_slice(text))
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 @contextmanager

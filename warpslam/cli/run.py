@@ -46,6 +46,7 @@ def add(commands: Any) -> None:
     )
     run.add_argument("--map", metavar="FILE", help="start from the map of another run (its folder, or the file)")
     run.add_argument("--localize", action="store_true", help="with --map: only track the camera, leave the map alone")
+    run.add_argument("--no-check", action="store_true", help="run even if the checks of the input find an error")
     _add_method_options(run)
     _add_checkpoint_option(run)
     add_run_options(run)
@@ -102,6 +103,7 @@ def _run(options: argparse.Namespace) -> int:
         truth_mesh=truth_mesh,
         map_path=map_path,
         localize_only=options.localize,
+        check_input=not options.no_check,
     )
 
 

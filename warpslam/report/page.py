@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import html
 from collections.abc import Iterable
 from importlib import resources
@@ -132,6 +133,8 @@ def write_page(content: Html, path: str | Path) -> Path:
         partial.write_text(content, encoding="utf-8")
         partial.replace(path)
     except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
         raise ConfigError(f"report {path} can't be written ({error.strerror}); choose another file with -o") from error
     return path
 

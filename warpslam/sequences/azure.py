@@ -46,7 +46,7 @@ def _from_intrinsic_json(path: Path) -> Calibration:
         fields = json.loads(path.read_text(encoding="utf-8"))
         fx, _, _, _, fy, _, cx, cy, _ = fields["intrinsic_matrix"]
         size = {"width": fields["width"], "height": fields["height"]}
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DatasetError(
             f"{path}: no camera of Open3D (width, height, intrinsic_matrix with 9 numbers): {error!r}; "
             "correct it or write a camera.yaml"

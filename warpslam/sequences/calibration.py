@@ -13,6 +13,7 @@ from warpslam.errors import ConfigError, DatasetError
 
 CAMERA_FIELDS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale")
 CAMERA_FILE = "camera.yaml"
+_MAX_SIZE = 16384  # [pixels], what OpenCV warps without trouble
 _OPTIONAL_FIELDS = ("distortion", "resize", "crop")
 _DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 
@@ -60,11 +61,17 @@ class Calibration:
                 "1000 for millimetres"
             )
         width, height = (_whole(values.pop(name), name, source) for name in ("width", "height"))
+        if max(width, height) > _MAX_SIZE:
+            raise DatasetError(
+                f"{source}: width x height = {width} x {height} must be at most {_MAX_SIZE} pixels each; correct it"
+            )
         resize = fields.get("resize")
         if resize is not None:
             pair = _numbers(resize, "resize", source)
-            if len(pair) != 2 or min(pair) < 1:
-                raise DatasetError(f"{source}: resize = {resize!r} must be [width, height] in pixels")
+            if len(pair) != 2 or min(pair) < 1 or max(pair) > _MAX_SIZE:
+                raise DatasetError(
+                    f"{source}: resize = {resize!r} must be [width, height] in pixels, 1 to {_MAX_SIZE} each"
+                )
             resize = (_whole(pair[0], "resize", source), _whole(pair[1], "resize", source))
         distortion = _numbers(fields.get("distortion") or (), "distortion", source)
         if len(distortion) not in _DISTORTION_LENGTHS:
@@ -86,7 +93,11 @@ class Calibration:
     @classmethod
     def from_yaml(cls, path: Path) -> Calibration:
         """Read a ``camera.yaml``."""
-        return cls.from_fields(_load_yaml(path.read_bytes(), str(path)), str(path))
+        try:
+            text = path.read_bytes()
+        except OSError as error:
+            raise DatasetError(f"{path}: can't be read ({error.strerror}); correct or remove the file") from error
+        return cls.from_fields(_load_yaml(text, str(path)), str(path))
 
     @classmethod
     def from_text(cls, text: str) -> Calibration:
@@ -134,7 +145,7 @@ def _load_yaml(text: bytes, source: str) -> dict[str, Any]:
 
     try:
         fields = yaml.safe_load(text)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # it lets those of numbers and dates through
         raise DatasetError(
             f"{source}: not valid YAML ({' '.join(str(error).split())}); write one 'name: number' a line"
         ) from error

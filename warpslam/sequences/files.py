@@ -16,6 +16,7 @@ from warpslam.sequences.calibration import Calibration
 from warpslam.sequences.images import read_depth, read_rgb
 
 FRAME_RATE = 30.0
+_FIRST_FRAMES = 10
 
 
 class FileSequence(RgbdSequence):
@@ -29,9 +30,10 @@ class FileSequence(RgbdSequence):
         poses: Camera-to-world transforms, OpenCV axes, shape (N, 4, 4), NaN where unknown, or None.
         timestamps: Times [s], shape (N,); index / 30 if None.
         color_size_may_differ: Resize colour to the size of the depth image instead of refusing another size.
+        remarks: What was left out in making the list of frames, for `warpslam check`.
 
     Raises:
-        DatasetError: If the counts differ, or the first frame can't be read or does not fit the camera.
+        DatasetError: If the counts differ, or none of the first frames can be read and fits the camera.
     """
 
     def __init__(
@@ -44,6 +46,7 @@ class FileSequence(RgbdSequence):
         poses: np.ndarray | None = None,
         timestamps: np.ndarray | None = None,
         color_size_may_differ: bool = False,
+        remarks: Sequence[str] = (),
     ) -> None:
         if len(rgb_files) != len(depth_files):
             raise DatasetError(
@@ -64,8 +67,8 @@ class FileSequence(RgbdSequence):
         self._rgb_files, self._depth_files = list(rgb_files), list(depth_files)
         self._poses = None if poses is None or np.isnan(poses).all() else poses
         self._color_size_may_differ = color_size_may_differ
-        # A camera that does not fit the images is found now rather than after a run has begun.
-        self._load(0)
+        self.remarks = tuple(remarks)
+        self._check_first_frames()
 
     def __len__(self) -> int:
         return len(self._rgb_files)
@@ -85,9 +88,27 @@ class FileSequence(RgbdSequence):
         """All poses, float64, shape (N, 4, 4), NaN where unknown; None if the sequence has none."""
         return None if self._poses is None else self._poses.copy()
 
+    def files(self, index: int) -> tuple[Path, Path]:
+        """Colour and depth file of a frame."""
+        return self._rgb_files[index], self._depth_files[index]
+
     def read_depth_metres(self, path: Path) -> np.ndarray:
         """Stored depth image in metres, float32, shape (H, W), 0 = missing."""
         return read_depth(path).astype(np.float32) / np.float32(self.calibration.depth_scale)
+
+    def _check_first_frames(self) -> None:
+        """A camera that does not fit the images is found now rather than after a run has begun; but a single bad frame
+        is none the worse for being the first.
+        """
+        first_error = None
+        for index in range(min(len(self), _FIRST_FRAMES)):
+            try:
+                self._load(index)
+                return
+            except DatasetError as error:
+                first_error = first_error or error
+        if first_error is not None:
+            raise first_error
 
     def _load(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         rgb, depth = read_rgb(self._rgb_files[index]), self.read_depth_metres(self._depth_files[index])

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+import zlib
 from pathlib import Path
 
 import numpy as np
 
 from warpslam.errors import DatasetError, MissingDependencyError
 
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
@@ -91,17 +93,34 @@ def _read_bytes(path: Path) -> bytes:
     return data
 
 
+def _has_right_checksums(data: bytes) -> bool:
+    """Whether every chunk of a PNG file has the checksum that stands behind it, up to the last one."""
+    at = len(_PNG_SIGNATURE)
+    while at + 12 <= len(data):
+        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        if end + 4 > len(data) or zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return False
+        if data[at + 4 : at + 8] == b"IEND":
+            return True
+        at = end + 4
+    return False
+
+
 def _decode(path: Path, flags: int) -> np.ndarray:
     import cv2
 
     data = _read_bytes(path)
-    # Some versions of OpenCV return a cut-off file as an image with a grey or black rest.
-    is_cut_png = data.startswith(b"\x89PNG") and b"IEND" not in data[-64:]
+    # OpenCV returns many a cut-off or damaged file as an image with a grey, black or wrong rest.
+    is_png = data.startswith(_PNG_SIGNATURE)
+    is_cut_png = is_png and b"IEND" not in data[-64:]
     is_cut_jpeg = data.startswith(b"\xff\xd8") and b"\xff\xd9" not in data[-1024:]
-    try:
-        image = None if is_cut_png or is_cut_jpeg else cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
-    except cv2.error:
-        image = None
+    is_damaged = is_png and not _has_right_checksums(data)
+    image = None
+    if not (is_cut_png or is_cut_jpeg or is_damaged):
+        try:
+            image = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
+        except cv2.error:
+            image = None
     if image is None:
         state = "truncated" if is_cut_png or is_cut_jpeg else "damaged or not an"
         raise DatasetError(f"{path}: {state} image ({len(data)} bytes); fetch the file again or remove the frame")

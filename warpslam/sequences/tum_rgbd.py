@@ -37,6 +37,13 @@ class TumRgbdSequence(FileSequence):
                 raise DatasetError(f"{pose_file}: holds no pose; fetch it again or remove it")
             pose_index, pose_gap = _nearest(rgb_times, pose_times)
             keep &= pose_gap < MAX_TIME_DIFFERENCE
+        remarks = []
+        if not keep.all():
+            partner = "depth image" if pose_file is None else "depth image and pose"
+            remarks.append(
+                f"{np.count_nonzero(~keep)} of {len(keep)} colour images of rgb.txt have no {partner} within "
+                f"{MAX_TIME_DIFFERENCE} s, the first at {rgb_times[~keep][0]:.6f} s"
+            )
         kept = _thin_out(rgb_times, np.flatnonzero(keep))
         if not len(kept):
             raise DatasetError(
@@ -61,6 +68,7 @@ class TumRgbdSequence(FileSequence):
             [depth for _, depth in frames],
             poses=poses,
             timestamps=rgb_times[kept],
+            remarks=remarks,
         )
 
 

@@ -1,0 +1,158 @@
+"""``warpslam batch``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from warpslam.cli.common import EXIT_INTERRUPTED, add_command, add_run_options, duration, parse_frames
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from warpslam.batch import Job, JobStatus
+
+EXIT_UNFINISHED = 1
+_LINES_A_JOB = 10
+
+
+def add(commands: Any) -> None:
+    """Add the command."""
+    batch = add_command(commands, "batch", _batch, "run many sequences, and go on where an earlier batch stopped")
+    batch.add_argument("folders", nargs="*", metavar="FOLDER", help="folders of one sequence each")
+    batch.add_argument("--manifest", metavar="FILE", help="yaml file with sequences and their settings")
+    batch.add_argument("--workers", type=int, metavar="N", help="sequences at a time (1; on a cluster: what fits)")
+    batch.add_argument("--memory-gb", type=float, metavar="GB", help="stop a worker that takes more memory than this")
+    batch.add_argument("--cluster", metavar="ADDRESS", help="run on Ray: ray://HOST:10001, or local")
+    batch.add_argument("--dataset", default="auto", help="format of the folders (default: told from their file names)")
+    batch.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
+    batch.add_argument("--preset", help="settings to start from (default: each dataset's)")
+    batch.add_argument("--frames", type=parse_frames, default=slice(None), metavar="A:B:STEP", help="frames to use")
+    add_run_options(batch, output="folder of the batch, with a folder a sequence and the summary (default: batch)")
+
+
+def _batch(options: argparse.Namespace) -> int:
+    from warpslam.batch import INTERRUPTED, run_batch
+    from warpslam.batch_summary import is_good, write_summary
+
+    jobs = _jobs(options)
+    output = Path(options.output or "batch")
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        from warpslam.output import output_error
+
+        raise output_error(error, output) from error
+    with _progress() as on_update:
+        if options.cluster:
+            from warpslam.cluster import run_on_ray
+
+            statuses = run_on_ray(
+                jobs, output, address=options.cluster, workers=options.workers, memory_gb=options.memory_gb,
+                on_update=on_update,
+            )  # fmt: skip
+        else:
+            workers = 1 if options.workers is None else options.workers
+            statuses = run_batch(jobs, output, workers=workers, memory_gb=options.memory_gb, on_update=on_update)
+    paths = write_summary(statuses, output)
+    _print_table(statuses)
+    print(f"written to  {paths[0]}, {paths[1]}")
+    if any(status.status == INTERRUPTED for status in statuses):
+        return EXIT_INTERRUPTED
+    return 0 if all(map(is_good, statuses)) else EXIT_UNFINISHED
+
+
+def _jobs(options: argparse.Namespace) -> list[Job]:
+    from warpslam.batch import Job, with_free_names
+    from warpslam.batch_manifest import read_manifest
+
+    frames = options.frames
+    common = Job(
+        name="", path="", dataset=options.dataset, camera=options.camera, preset=options.preset,
+        frames=(frames.start, frames.stop, frames.step), overrides=tuple(options.overrides),
+        decoders=str(Path(options.decoders).resolve()) if options.decoders else None, device=options.device,
+        seed=options.seed,
+    )  # fmt: skip
+    paths = [Path(folder).expanduser().resolve() for folder in options.folders]
+    jobs = [replace(common, name=path.name, path=str(path)) for path in paths]
+    if options.manifest:
+        jobs += read_manifest(options.manifest, common)
+    return with_free_names(jobs)
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[JobStatus], None]]:
+    """A table that is kept up to date on a terminal, lines anywhere else."""
+    if not sys.stdout.isatty():
+        yield _Lines().show
+        return
+    from rich.live import Live
+
+    known: dict[str, JobStatus] = {}
+    with Live(_table([]), refresh_per_second=4) as live:
+
+        def show(status: JobStatus) -> None:
+            known[status.name] = status
+            live.update(_table(list(known.values())))
+
+        yield show
+        # The summary follows; the same table twice would only be read twice.
+        live.update("")
+
+
+class _Lines:
+    """A line when a job changes its state, and about ten for its frames."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, tuple[str, int]] = {}
+
+    def show(self, status: JobStatus) -> None:
+        """Print, if there is something new."""
+        from warpslam.batch_summary import first_line
+
+        tenth = _LINES_A_JOB * status.done // status.total if status.total else 0
+        if self._last.get(status.name) == (status.status, tenth):
+            return
+        self._last[status.name] = (status.status, tenth)
+        parts = [f"{status.name}: {status.status}"]
+        if status.total:
+            parts.append(f"frame {status.done}/{status.total}")
+        if status.fps is not None:
+            parts.append(f"{status.fps:.2f} fps")
+        if status.ate_rmse is not None:
+            parts.append(f"ATE {100 * status.ate_rmse:.2f} cm")
+        if status.message:
+            parts.append(first_line(status.message))
+        print("  ".join(parts), flush=True)
+
+
+def _table(statuses: Sequence[JobStatus]) -> Any:
+    from rich.table import Table
+    from rich.text import Text
+
+    from warpslam.batch import RUNNING, WAITING
+    from warpslam.batch_summary import COLUMNS, cells, is_good
+
+    table = Table()
+    for number, column in enumerate(COLUMNS):
+        table.add_column(column, justify="right" if 2 <= number <= 7 else "left", overflow="fold")
+    for status in statuses:
+        style = "" if status.status in (RUNNING, WAITING) else "green" if is_good(status) else "red"
+        first, state, *rest = map(Text, cells(status))
+        state.stylize(style)
+        table.add_row(first, state, *rest)
+    return table
+
+
+def _print_table(statuses: Sequence[JobStatus]) -> None:
+    from rich.console import Console
+
+    # Where there is no terminal rich assumes 80 columns, which would fold every cell.
+    Console(width=None if sys.stdout.isatty() else 160).print(_table(statuses))
+    seconds = sum(status.seconds or 0.0 for status in statuses)
+    print(f"{len(statuses)} sequences, {duration(seconds)} of work")

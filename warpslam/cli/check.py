@@ -1,0 +1,39 @@
+"""``warpslam check``."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from warpslam.cli.common import add_command
+
+EXIT_FINDINGS = 1
+
+
+def add(commands: Any) -> None:
+    """Add the command."""
+    check = add_command(commands, "check", _check, "whether a folder of RGB-D frames can be used, before a run")
+    check.add_argument("folder", metavar="FOLDER", help="folder of one sequence")
+    check.add_argument("--dataset", default="auto", help="format of the folder (default: told from its file names)")
+    check.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
+    check.add_argument("--all", action="store_true", help="read every frame, not a sample of them")
+    check.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _check(options: argparse.Namespace) -> int:
+    from warpslam.checking import THOROUGH_SAMPLES, check_folder
+    from warpslam.run_folder import to_json
+
+    count = None if options.all else THOROUGH_SAMPLES
+    report = check_folder(options.folder, options.dataset, options.camera, sample_count=count)
+    if options.json:
+        print(to_json(report.to_dict()))
+    else:
+        if report.name:
+            print(f"{report.name}: {report.frames} frames")
+        for finding in report.findings:
+            print(f"{finding.severity:8} {finding.check:16} {finding.message}")
+            if finding.remedy:
+                print(f"{'':8} {'':16} -> {finding.remedy}")
+        print(f"{len(report.errors)} errors, {len(report.warnings)} warnings")
+    return EXIT_FINDINGS if report.errors else 0

@@ -1,0 +1,107 @@
+"""Do poses and depth images belong together? Points of one frame are carried into another one and compared with it.
+
+A pose file that holds world-to-camera matrices, or OpenGL axes, is read without complaint and makes every error figure
+meaningless. Only the motion from frame i to frame j tells: with the right reading of the matrices, the points that
+frame i measured lie on what frame j measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpslam.camera import Intrinsics
+
+OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+CONVENTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "camera-to-world, OpenCV axes": lambda T: T,
+    "camera-to-world, OpenGL axes": lambda T: T @ OPENGL_FROM_OPENCV,
+    "world-to-camera, OpenCV axes": lambda T: np.linalg.inv(T),
+    "world-to-camera, OpenGL axes": lambda T: np.linalg.inv(OPENGL_FROM_OPENCV @ T),
+}
+"""How a stored matrix may be meant: T_world_camera in OpenCV axes from the stored one."""
+EXPECTED = next(iter(CONVENTIONS))
+
+TOLERANCE = 0.04
+"""Two depths agree if they differ by less than this share."""
+MIN_OVERLAP = 0.3
+_MIN_ANGLE, _MAX_ANGLE = np.radians(8.0), np.radians(45.0)
+_MIN_SHIFT = 0.2  # [m]
+_POINT_COUNT = 5000
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """depth: z-depth [m], (H, W), 0 = missing. pose: Matrix as stored, (4, 4)."""
+
+    depth: np.ndarray
+    pose: np.ndarray
+
+
+def moving_pairs(poses: np.ndarray, count: int) -> list[tuple[int, int]]:
+    """Pairs of frames far enough apart to tell one convention from another, and near enough to overlap.
+
+    Args:
+        poses: Matrices as stored, (N, 4, 4), NaN where unknown.
+        count: Pairs wanted, spread over the sequence.
+
+    Returns:
+        Positions (i, j), i < j; fewer than ``count`` if the camera hardly moves.
+    """
+    known = np.isfinite(poses).all(axis=(1, 2))
+    pairs = []
+    for first in np.unique(np.linspace(0, max(len(poses) - 2, 0), count).round().astype(int)):
+        if not known[first]:
+            continue
+        later = np.flatnonzero(known[first + 1 :]) + first + 1
+        rotations = poses[later, :3, :3]
+        trace = np.einsum("nij,ij->n", rotations, poses[first, :3, :3])
+        angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+        shift = np.linalg.norm(poses[later, :3, 3] - poses[first, :3, 3], axis=1)
+        enough = later[((angle > _MIN_ANGLE) | (shift > _MIN_SHIFT)) & (angle < _MAX_ANGLE)]
+        if len(enough):
+            pairs.append((int(first), int(enough[0])))
+    return pairs
+
+
+def agreement(
+    pairs: list[tuple[DepthView, DepthView]], camera: Intrinsics, convention: str = EXPECTED, depth_factor: float = 1.0
+) -> float:
+    """Share of the points carried from one frame into another that lie on what the other measured, in [0, 1].
+
+    Args:
+        pairs: Frames and their stored matrices.
+        camera: Camera of the depth images.
+        convention: One of `CONVENTIONS`.
+        depth_factor: Depth is multiplied by this first.
+    """
+    read = CONVENTIONS[convention]
+    agreeing = compared = 0.0
+    for a, b in pairs:
+        T_b_a = np.linalg.inv(read(b.pose)) @ read(a.pose)
+        points = _points(a.depth * depth_factor, camera) @ T_b_a[:3, :3].T + T_b_a[:3, 3]
+        z = points[:, 2]
+        ahead = z > 1e-6
+        u, v = (
+            np.rint(f * points[ahead, axis] / z[ahead] + c)
+            for f, axis, c in ((camera.fx, 0, camera.cx), (camera.fy, 1, camera.cy))
+        )
+        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        measured = b.depth[v[inside].astype(int), u[inside].astype(int)] * depth_factor
+        valid = measured > 0
+        close = np.abs(z[ahead][inside] - measured) < TOLERANCE * measured
+        agreeing += np.count_nonzero(close & valid)
+        # Points that leave the image prove nothing, but a convention that throws nearly all out has not won.
+        compared += max(float(np.count_nonzero(valid)), MIN_OVERLAP * len(points))
+    return agreeing / compared if compared else 0.0
+
+
+def _points(depth: np.ndarray, camera: Intrinsics) -> np.ndarray:
+    """Points (N, 3) [m] of a depth image in its camera's frame, about `_POINT_COUNT` of them."""
+    stride = max(1, int(np.sqrt(depth.size / _POINT_COUNT)))
+    v, u = np.nonzero(depth[::stride, ::stride])
+    z = depth[::stride, ::stride][v, u].astype(np.float64)
+    return np.stack([(u * stride - camera.cx) / camera.fx * z, (v * stride - camera.cy) / camera.fy * z, z], axis=1)
