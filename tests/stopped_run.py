@@ -37,7 +37,7 @@ def kill_at(owner: Any, name: str, count: int) -> None:
 def main() -> int:
     point, count, arguments = sys.argv[1], int(sys.argv[2]), sys.argv[3:]
     targets = {
-        "map": (Mapper, "map_frame"),
+        "map": (Mapper, "start_frame"),
         "write": (os, "fsync"),
         "rename": (Path, "replace"),
         "refine": (Mapper, "refine"),

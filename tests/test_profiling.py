@@ -136,9 +136,11 @@ def test_trace_shows_both_threads(run, tmp_path):
         assert 0 <= event["ts"] and event["ts"] + event["dur"] <= 1e6 * profile.wall_seconds + 1
     kernels = [event for event in events if event["cat"] == "kernel"]
     assert len(kernels) == profile.report.launch_count
-    for thread in (0, 1):
+    # The second slice may run on any thread of the pool.
+    forward = [event["tid"] for event in kernels if event["name"] == "middle_forward"]
+    assert forward.count(0) > 10 and len(forward) - forward.count(0) > 10
+    for thread in names:
         own = [event for event in kernels if event["tid"] == thread]
-        assert sum(event["name"] == "middle_forward" for event in own) > 10
         for before, after in zip(own, own[1:], strict=False):
             assert after["ts"] >= before["ts"] + before["dur"] - 0.01
     tracking = [event for event in events if event["cat"] == "phase" and event["name"] == "tracking"]

@@ -81,7 +81,7 @@ def test_refuses_to_grow_beyond_what_is_free(monkeypatch):
     scene.cover(np.zeros(3), np.ones(3))
     before = scene.bounds[1].copy()
     monkeypatch.setattr("warpslam.scene.free_gigabytes", lambda device: 0.01)
-    with pytest.raises(MapSizeError, match=r"needs 2\.\d GB more, and cpu has 0.0 GB free"):
+    with pytest.raises(MapSizeError, match=r"needs \d\.\d GB more, and cpu has 0.0 GB free"):
         scene.cover(np.zeros(3), np.full(3, 20.0))
     np.testing.assert_array_equal(scene.bounds[1], before)
     monkeypatch.setattr("warpslam.scene.free_gigabytes", lambda device: None)

@@ -10,6 +10,7 @@ from warpslam.baselines.imap import Imap
 from warpslam.camera import Intrinsics
 from warpslam.config import PRESETS, Config
 from warpslam.errors import CheckpointError, InputError
+from warpslam.evaluation import psnr
 from warpslam.run_folder import RunFolder
 
 CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5, 64, 48)
@@ -56,7 +57,7 @@ def test_it_learns_a_frame(trained):
         view = trained.render(pose, stride=2, depth=guide)
         assert view.depth.shape == (24, 32) and view.rgb.shape == (24, 32, 3)
         assert np.median(np.abs(view.depth - depth[::2, ::2])) < 0.15
-        assert pipeline.psnr(view.rgb, rgb[::2, ::2]) > 18
+        assert psnr(view.rgb, rgb[::2, ::2]) > 18
     assert trained.map_bytes == 4 * 222_747 and trained.flops_per_point == 443_908
 
 
