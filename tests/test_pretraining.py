@@ -14,6 +14,7 @@ import pretrain_decoders  # noqa: E402
 from pretraining.evaluation import fit_room, free_space_feature  # noqa: E402
 from pretraining.mapping import RayPool, random_placement, ray_weights, sample_distances, stage_of  # noqa: E402
 from pretraining.networks import DecoderSet, Lattice, LevelDecoder, PointEncoder, interpolate  # noqa: E402
+from pretraining.quiet import quiet_fine_decoder  # noqa: E402
 from pretraining.room_samples import HELD_OUT_SEED, SampleSizes, make_samples, march  # noqa: E402
 from pretraining.training import Trainer, TrainingConfig  # noqa: E402
 
@@ -285,3 +286,29 @@ def test_commands(tmp_path, capsys):
     assert load_decoders(tmp_path / "export.pth").middle.hidden == 32
     missing = ["export", "--out", str(tmp_path / "none"), "--to", str(tmp_path / "x.pth")]
     assert pretrain_decoders.main(missing) == 2 and "no such file" in capsys.readouterr().err
+
+
+def test_quiet_fine_decoder_is_silent_and_else_the_same(room):
+    """At zero feature little is left of what it said; the middle, coarse and colour decoders are untouched."""
+    weights = random_decoders(3)
+    quiet = quiet_fine_decoder(weights, [room], 60, lambda line: None)
+    points = torch.rand(500, 3)
+    silent = torch.cat([torch.zeros(500, 32), 0.2 * torch.randn(500, 32)], dim=1)
+    before, after = (LevelDecoder(w.fine)(points, silent).detach().abs().mean() for w in (weights, quiet))
+    assert after < 0.5 * before
+    for level in ("coarse", "middle", "color"):
+        assert getattr(quiet, level) is getattr(weights, level)
+
+
+def test_average_lies_between(tmp_path):
+    """Each tensor is the weighted mean of the two files; the coarse decoder comes from where it is asked for."""
+    for seed in (1, 2):
+        random_decoders(seed).save(tmp_path / f"{seed}.pth")
+    files = ["--start", str(tmp_path / "1.pth"), "--other", str(tmp_path / "2.pth"), "--share", "0.25"]
+    out = tmp_path / "out"
+    assert pretrain_decoders.main(["average", "--out", str(out), *files, "--coarse-from", str(tmp_path / "2.pth")]) == 0
+    mixed, one, two = (load_decoders(path) for path in (out / "decoders.pth", tmp_path / "1.pth", tmp_path / "2.pth"))
+    name = "pts_linears.1.weight"
+    expected = 0.75 * one.fine.tensors[name] + 0.25 * two.fine.tensors[name]
+    np.testing.assert_allclose(mixed.fine.tensors[name], expected, atol=1e-7)
+    np.testing.assert_array_equal(mixed.coarse.tensors[name], two.coarse.tensors[name])

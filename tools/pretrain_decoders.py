@@ -1,7 +1,8 @@
-"""Pretrain the decoders on procedural rooms (supplement A.5): `train`, `quiet`, `evaluate`, `export`.
+"""Pretrain the decoders on procedural rooms (supplement A.5): `train`, `average`, `quiet`, `evaluate`, `export`.
 
     python tools/pretrain_decoders.py train --out runs/pretraining --minutes 20
-    python tools/pretrain_decoders.py quiet --out runs/quiet --start runs/pretraining/decoders.pth
+    python tools/pretrain_decoders.py average --out runs/mixed --start first.pth --other second.pth --share 0.35
+    python tools/pretrain_decoders.py quiet --out runs/quiet --start runs/mixed/decoders.pth
     python tools/pretrain_decoders.py evaluate --out runs/pretraining --also other=some_decoders.pth
     python tools/pretrain_decoders.py export --out runs/pretraining --to warpslam/data/decoders.pth
 
@@ -103,6 +104,23 @@ def evaluate(options: argparse.Namespace) -> int:
     return 0
 
 
+def average(options: argparse.Namespace) -> int:
+    """Average each tensor of two files, one of which was trained on from the other; writes decoders.pth."""
+    first, second = load_decoders(options.start), load_decoders(options.other)
+    levels = {}
+    for mine, theirs in zip(first, second, strict=True):
+        tensors = {
+            name: ((1 - options.share) * array + options.share * theirs.tensors[name]).astype(np.float32)
+            for name, array in mine.tensors.items()
+        }
+        levels[mine.level] = dataclasses.replace(mine, tensors=tensors)
+    if options.coarse_from:
+        levels["coarse"] = load_decoders(options.coarse_from).coarse
+    options.out.mkdir(parents=True, exist_ok=True)
+    dataclasses.replace(first, **levels).save(options.out / "decoders.pth")
+    return 0
+
+
 def quiet(options: argparse.Namespace) -> int:
     """Make the fine decoder silent at zero feature, from decoders in a file; writes decoders.pth."""
     options.out.mkdir(parents=True, exist_ok=True)
@@ -114,11 +132,8 @@ def quiet(options: argparse.Namespace) -> int:
 
 
 def export(options: argparse.Namespace) -> int:
-    """Copy the trained decoders to a file of tensors alone, and read it back; the coarse one from another run if asked.
-    """
+    """Copy the trained decoders to a file of tensors alone, and read it back."""
     decoders = load_decoders(options.out / "decoders.pth")
-    if options.coarse_from:
-        decoders = dataclasses.replace(decoders, coarse=load_decoders(options.coarse_from).coarse)
     decoders.save(options.to)
     state, again = decoders.state_dict(), load_decoders(options.to).state_dict()
     assert all(np.array_equal(state[name], again[name]) for name in state)
@@ -216,6 +231,12 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--budgets", type=int, nargs="+", default=[10, 30, 60, 120], help="mapping iterations")
     command.add_argument("--seed", type=int, default=0, help="seed of the random decoders")
     command.set_defaults(run=evaluate)
+    command = commands.add_parser("average", parents=[shared], help="average two decoder files")
+    command.add_argument("--start", type=Path, required=True, help="one file")
+    command.add_argument("--other", type=Path, required=True, help="the other file, of the same widths")
+    command.add_argument("--share", type=float, default=0.5, help="of the other file in the average")
+    command.add_argument("--coarse-from", type=Path, help="take the coarse decoder from this file")
+    command.set_defaults(run=average)
     command = commands.add_parser("quiet", parents=[shared], help="silence the fine decoder at zero feature")
     command.add_argument("--start", type=Path, required=True, help="decoders to start from")
     command.add_argument("--rooms", type=int, default=12, help="training rooms that are mapped for features")
@@ -223,7 +244,6 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("--seed", type=int, default=0, help="seed of the draws")
     command.set_defaults(run=quiet)
     command = commands.add_parser("export", parents=[shared], help="write the package's file")
-    command.add_argument("--coarse-from", type=Path, help="take the coarse decoder from this file")
     command.add_argument("--to", type=Path, default=ROOT / "warpslam" / "data" / "decoders.pth")
     command.set_defaults(run=export)
     return parser
