@@ -116,7 +116,15 @@ def test_kernels_are_compiled_once(tmp_path):
     assert running["good"] - running["compiling"] > 0.5 > running["good2"] - running["good"]
 
 
-def test_interrupt_stops_workers_and_the_rest_waits(tmp_path):
+@pytest.fixture
+def heard_interrupts():
+    """Ctrl-C arrives, also where the tests were started in the background of a shell, which has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_interrupt_stops_workers_and_the_rest_waits(tmp_path, heard_interrupts):
     """Ctrl-C: the running job is told to write what it has, the next one is not started, and both go on later."""
     sent = []
 

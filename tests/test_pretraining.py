@@ -288,8 +288,9 @@ def test_commands(tmp_path, capsys):
     assert pretrain_decoders.main(missing) == 2 and "no such file" in capsys.readouterr().err
 
 
-def test_quiet_fine_decoder_is_silent_and_else_the_same(room):
+def test_quiet_fine_decoder_is_silent_and_else_the_same():
     """At zero feature little is left of what it said; the middle, coarse and colour decoders are untouched."""
+    room = make_samples(BoxRoom(), 0, replace(SIZES, rays=200))
     weights = random_decoders(3)
     quiet = quiet_fine_decoder(weights, [room], 60, lambda line: None)
     points = torch.rand(500, 3)
