@@ -17,7 +17,6 @@ from warpslam import cli, demo, launching
 from warpslam.camera import Intrinsics
 from warpslam.errors import WarpSlamError
 from warpslam.field import Thresholds
-from warpslam.kernels.decoder import BLOCK_SIZE
 from warpslam.profiling import costs, phase, phases, recorder
 from warpslam.synthetic import SyntheticSequence
 
@@ -26,7 +25,7 @@ KERNELS = {
     "fill_grid", "project_vertices", "select_vertices", "clear_moments", "draw_pixels", "cast_rays", "bound_rays",
     "place_samples", "start_rays", "coarse_forward", "coarse_backward", "middle_forward", "fine_forward",
     "color_forward", "geometry_backward", "color_backward", "composite", "composite_color", "ray_variance",
-    "composite_backward", "collect_ray_gradients", "mapping_loss", "mapping_loss (adjoint)", "tracking_loss",
+    "list_weighty", "list_steep", "composite_backward", "collect_ray_gradients", "mapping_loss", "mapping_loss (adjoint)", "tracking_loss",
     "tracking_loss (adjoint)", "cast_rays (adjoint)", "tracking_residuals", "choose_inliers", "lower_median",
     "adam_rows", "adam_poses", "advance_step", "note_pose", "transpose_color_weights", "_classify_kernel",
     "_facing_kernel",
@@ -234,9 +233,7 @@ def test_counted_points_are_those_computed(frames, min_transmittance, monkeypatc
     total = batch.count * batch.sample_count
     for level in ("middle", "fine", "color"):
         written = (batch.bits[level].numpy()[:total] != 0xFFFFFFFF).any(axis=1).sum()
-        # Blocks with one heavy sample are computed, and leave out the light ones' colours.
-        block = BLOCK_SIZE["cuda" if slam.device.is_cuda else "cpu"] if level == "color" else 1
-        assert counted[f"{level}_forward"] <= written <= block * counted[f"{level}_forward"]
+        assert counted[f"{level}_forward"] == written
     assert 0 < counted["color_forward"] < counted["fine_forward"] <= total
     assert (counted["fine_forward"] < total) == (min_transmittance > 0)
 
@@ -247,7 +244,9 @@ def test_counted_points_are_those_computed(frames, min_transmittance, monkeypatc
     batch.point_grad.zero_()
     from warpslam.field import Gradients
 
-    step = batch._geometry_adjoint(arrays, "middle", Gradients(points=True), 0, batch.count, 0, 0.25, batch.point_grad)
+    batch.steep_count.zero_()
+    batch.launcher.launch(*batch._steep(0, batch.count, 0, 0.25))
+    step = batch._geometry_adjoint(arrays, "middle", Gradients(points=True), 0, batch.count, 0, batch.point_grad)
     with warpslam.profile() as profile:
         batch.launcher.launch(*step)
     (launch,) = profile.launches

@@ -225,6 +225,10 @@ class RayBatch:
         self.logit_grad = zeros(points)
         self.color_grad = zeros(points, wp.vec3)
         self.point_grad = zeros(points, wp.vec3)
+        # Samples that need colour and samples whose logit has a gradient, by slice.
+        self.weighty, self.steep = zeros(points, int), zeros(points, int)
+        counts = compositing.COUNT_STRIDE * slice_count(device)
+        self.weighty_count, self.steep_count = zeros(counts, int), zeros(counts, int)
         self.bits = {
             level: wp.zeros((points, decoder.MASK_WORDS), dtype=wp.uint32, device=device)
             for level in ("middle", "fine", "color")
@@ -317,9 +321,10 @@ class RayBatch:
         """Logit (and colour, in the colour stage) of every sample: `logit`, `color`."""
 
         def steps(first: int, stop: int, slot: int) -> list[Step]:
-            result = [self._start(first, stop), *self._logits(arrays, stage, first, stop, 0, self.sample_count, EXACT)]
+            start = self._start(first, stop, slot)
+            result = [start, *self._logits(arrays, stage, first, stop, 0, self.sample_count, EXACT)]
             if stage == "color":
-                result.append(self._colors(arrays, first, stop, 0.0))
+                result += self._colors(arrays, first, stop, slot, 0.0)
             return result
 
         self.launcher.slices(self.count, steps)
@@ -347,7 +352,7 @@ class RayBatch:
 
         def steps(first: int, stop: int, slot: int) -> list[Step]:
             ray_count = stop - first
-            result = [self._start(first, stop)]
+            result = [self._start(first, stop, slot)]
             for sample in range(0, samples, width):
                 group = min(width, samples - sample)
                 result += self._logits(arrays, stage, first, stop, sample, group, thresholds)
@@ -357,7 +362,7 @@ class RayBatch:
             inputs = [first, samples, self.z, self.keep, self.weight, self.depth, self.variance]
             result.append((compositing.ray_variance, ray_count, inputs))
             if stage == "color":
-                result.append(self._colors(arrays, first, stop, thresholds.min_weight, want_activations))
+                result += self._colors(arrays, first, stop, slot, thresholds.min_weight, want_activations)
                 inputs = [first, samples, self.keep, self.color, self.weight, self.rgb]
                 result.append((compositing.composite_color, ray_count, inputs))
             return result
@@ -371,8 +376,8 @@ class RayBatch:
         inputs = [self.sample_count, self.keep, self.z, self.logit, self.weight, min_occupancy, self.depth]
         self.launcher.launch(compositing.surface_depth, self.count, inputs)
 
-    def _start(self, first: int, stop: int) -> Step:
-        inputs = [first, self.keep, self.transmittance, self.depth, self.variance, self.rgb]
+    def _start(self, first: int, stop: int, slot: int) -> Step:
+        inputs = [first, slot, self.weighty_count, self.keep, self.transmittance, self.depth, self.variance, self.rgb]
         return (compositing.start_rays, stop - first, inputs)
 
     def _logits(
@@ -398,15 +403,26 @@ class RayBatch:
         return steps
 
     def _colors(
-        self, arrays: FieldArrays, first: int, stop: int, min_weight: float, want_activations: bool = False
-    ) -> Step:
-        # Rays that ended early have weights, too: only those that are not kept (transmittance -1) get no colour.
-        count = (stop - first) * self.sample_count
-        inputs = [count, first, 0, self.sample_count, 32, self.sample_count, self.origin, self.direction, self.z]
-        inputs += [self.transmittance, 0.0, arrays.lattices["color"], arrays.features["color"]]
-        inputs += [arrays.decoders["color"].weights, self.bits["color"], int(want_activations), self._activations]
-        inputs += [self.weight, min_weight, self.color]
-        return (self.kernels.color_forward, self.kernels.thread_count(count), inputs)
+        self,
+        arrays: FieldArrays,
+        first: int,
+        stop: int,
+        slot: int,
+        min_weight: float,
+        want_activations: bool = False,
+    ) -> list[Step]:
+        samples = self.sample_count
+        dim = self.kernels.thread_count((stop - first) * samples)
+        listed = [self.weighty, self.weighty_count]
+        choose = [first, slot, samples, self.keep, self.weight, min_weight, self.color, *listed]
+        inputs = [first * samples, slot, *listed, 32, samples, self.origin, self.direction, self.z]
+        inputs += [arrays.lattices["color"], arrays.features["color"], arrays.decoders["color"].weights]
+        inputs += [self.bits["color"], int(want_activations), self._activations, self.color]
+        return [(compositing.list_weighty, stop - first, choose), (self.kernels.color_forward, dim, inputs)]
+
+    def _steep(self, first: int, stop: int, slot: int, min_gradient: float) -> Step:
+        inputs = [first, slot, self.sample_count, self.logit_grad, min_gradient, self.steep, self.steep_count]
+        return (compositing.list_steep, stop - first, inputs)
 
     def _make_room_for_activations(self) -> None:
         size = self.capacity * self.max_samples
@@ -423,17 +439,15 @@ class RayBatch:
         want_weights = gradients.color_weights is not None
 
         def steps(first: int, stop: int, slot: int) -> list[Step]:
-            inputs = [first, samples, self.z, self.keep, self.logit, int(stage == "color"), self.color, self.weight]
-            inputs += [thresholds.min_weight, self.depth.grad, self.rgb.grad, self.logit_grad, self.color_grad]
+            inputs = [first, slot, self.steep_count, samples, self.z, self.keep, self.logit, int(stage == "color")]
+            inputs += [self.color, self.weight, thresholds.min_weight, self.depth.grad, self.rgb.grad]
+            inputs += [self.logit_grad, self.color_grad]
             result: list[Step] = [(compositing.composite_backward, stop - first, inputs)]
+            result.append(self._steep(first, stop, slot, thresholds.min_gradient))
             levels = {"coarse": ("coarse",), "middle": ("middle",)}.get(stage, ("middle", "fine"))
             for level in levels:
                 if gradients.points or level in gradients.grids:
-                    result.append(
-                        self._geometry_adjoint(
-                            arrays, level, gradients, first, stop, slot, thresholds.min_gradient, self.point_grad
-                        )
-                    )
+                    result.append(self._geometry_adjoint(arrays, level, gradients, first, stop, slot, self.point_grad))
             if stage == "color" and (gradients.points or want_weights or "color" in gradients.grids):
                 result.append(self._color_adjoint(arrays, gradients, first, stop, slot, self.point_grad))
             if gradients.points:
@@ -476,19 +490,18 @@ class RayBatch:
         first: int,
         stop: int,
         slot: int,
-        min_gradient: float,
         point_grad: wp.array,
     ) -> Step:
         samples = self.sample_count
-        count = (stop - first) * samples
-        head, dim = [count, first * samples, slot], self.kernels.thread_count(count)
+        dim = self.kernels.thread_count((stop - first) * samples)
+        head = [first * samples, slot, self.steep, self.steep_count]
         if level == "coarse":
             packed = arrays.decoders["coarse"]
             inputs = [*head, 32, samples, self.origin, self.direction, self.z, arrays.lattices["coarse"]]
             inputs += [packed.weights, packed.transposed, self.bits["coarse"], self.logit_grad]
             return (self.kernels.coarse_backward, dim, inputs + self._grid_gradient(gradients, "coarse")[1:])
         output = decoder.OUT_64 if level == "fine" else decoder.OUT_32
-        inputs = [*head, *self._common(arrays, level), output, self.bits[level], self.logit_grad, min_gradient]
+        inputs = [*head, *self._common(arrays, level), output, self.bits[level], self.logit_grad]
         inputs += [*self._grid_gradient(gradients, level), int(gradients.points), point_grad]
         return (self.kernels.geometry_backward, dim, inputs)
 
@@ -497,11 +510,11 @@ class RayBatch:
     ) -> Step:
         samples = self.sample_count
         buffers = self._no_rows if gradients.color_weights is None else gradients.color_weights
-        count = (stop - first) * samples
-        inputs = [count, first * samples, slot, *self._common(arrays, "color"), self.bits["color"], self.color_grad]
+        inputs = [first * samples, slot, self.weighty, self.weighty_count, *self._common(arrays, "color")]
+        inputs += [self.bits["color"], self.color_grad]
         inputs += [*self._grid_gradient(gradients, "color"), int(gradients.points), point_grad]
         inputs += [int(gradients.color_weights is not None), self._activations, buffers, self._layer_grad]
-        return (self.kernels.color_backward, self.kernels.thread_count(count), inputs)
+        return (self.kernels.color_backward, self.kernels.thread_count((stop - first) * samples), inputs)
 
     # -- losses --------------------------------------------------------------------------------------------------
 
@@ -539,13 +552,14 @@ class RayBatch:
         motion, samples, wanted = self._motion, self.sample_count, Gradients(points=True)
 
         def steps(first: int, stop: int, slot: int) -> list[Step]:
-            inputs = [first, samples, self.z, self.inlier, self.logit, self.color, self.weight]
+            inputs = [first, slot, self.steep_count, samples, self.z, self.inlier, self.logit, self.color, self.weight]
             inputs += [thresholds.min_weight, thresholds.min_gradient, motion.by_logit]
             result: list[Step] = [
-                (gauss_newton.ray_derivatives, stop - first, [*inputs, self.logit_grad, self.color_grad])
+                (gauss_newton.ray_derivatives, stop - first, [*inputs, self.logit_grad, self.color_grad]),
+                self._steep(first, stop, slot, 0.0),
             ]
             for level in ("middle", "fine"):
-                adjoint = self._geometry_adjoint(arrays, level, wanted, first, stop, slot, 0.0, self.point_grad)
+                adjoint = self._geometry_adjoint(arrays, level, wanted, first, stop, slot, self.point_grad)
                 result.append(adjoint)
             result.append(self._color_adjoint(arrays, wanted, first, stop, slot, motion.grey_by_point))
             inputs = [first, samples, self.z, self.direction, motion.by_logit, self.point_grad, motion.grey_by_point]

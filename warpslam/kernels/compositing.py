@@ -14,16 +14,27 @@ min_weight. Where T_i < ``min_transmittance`` at the start of a group of samples
 they count as outside with w = 0. What is left out weighs less than min_transmittance in all, so that depth errs by less
 than min_transmittance * z_max, and rgb by less than min_transmittance * the brightest colour.
 Per-sample arrays have shape (ray_count * sample_count,). Rays that are not kept render 0 and have no gradient.
+
+The samples that need colour, and those whose logit has a gradient, are listed: a launch over the rays from ``start`` on
+fills ``listed`` from ``start * sample_count`` on, and the entry of ``listed_count`` that `count_index` gives to its slot.
 """
 
 import warp as wp
 
 OUTSIDE_LOGIT = wp.constant(100.0)
+# Slices run side by side: each has a cache line of its own.
+COUNT_STRIDE = wp.constant(16)
 
 
 @wp.func
 def is_inside(p: wp.vec3, low: wp.vec3, high: wp.vec3) -> bool:
     return p[0] > low[0] and p[0] < high[0] and p[1] > low[1] and p[1] < high[1] and p[2] > low[2] and p[2] < high[2]
+
+
+@wp.func
+def count_index(slot: int) -> int:
+    """Entry of a list's counts for a slice of rays."""
+    return COUNT_STRIDE * slot
 
 
 @wp.func
@@ -34,14 +45,18 @@ def occupancy(logit: float) -> float:
 @wp.kernel(enable_backward=False)
 def start_rays(
     start: int,
+    slot: int,
+    listed_count: wp.array(dtype=int),
     keep: wp.array(dtype=int),
     transmittance: wp.array(dtype=float),
     depth: wp.array(dtype=float),
     variance: wp.array(dtype=float),
     rgb: wp.array(dtype=wp.vec3),
 ):
-    """Nothing absorbed yet; a transmittance of -1 marks rays that are not kept."""
+    """Nothing absorbed yet, nothing listed; a transmittance of -1 marks rays that are not kept."""
     tid = start + wp.tid()
+    if wp.tid() == 0:
+        listed_count[count_index(slot)] = 0
     transmittance[tid] = wp.where(keep[tid] != 0, 1.0, -1.0)
     depth[tid] = 0.0
     variance[tid] = 0.0
@@ -111,6 +126,60 @@ def ray_variance(
 
 
 @wp.kernel(enable_backward=False)
+def list_weighty(
+    start: int,
+    slot: int,
+    sample_count: int,
+    keep: wp.array(dtype=int),
+    weight: wp.array(dtype=float),
+    min_weight: float,
+    color: wp.array(dtype=wp.vec3),
+    listed: wp.array(dtype=int),
+    listed_count: wp.array(dtype=int),
+):
+    """List the samples that weigh at least ``min_weight``, and make the others black."""
+    tid = start + wp.tid()
+    if keep[tid] == 0:
+        return
+    first = tid * sample_count
+    count = int(0)
+    for n in range(sample_count):
+        if weight[first + n] >= min_weight:
+            count += 1
+        else:
+            color[first + n] = wp.vec3()
+    place = start * sample_count + wp.atomic_add(listed_count, count_index(slot), count)
+    for n in range(sample_count):
+        if weight[first + n] >= min_weight:
+            listed[place] = first + n
+            place += 1
+
+
+@wp.kernel(enable_backward=False)
+def list_steep(
+    start: int,
+    slot: int,
+    sample_count: int,
+    logit_grad: wp.array(dtype=float),
+    min_gradient: float,
+    listed: wp.array(dtype=int),
+    listed_count: wp.array(dtype=int),
+):
+    """List the samples with a gradient beyond ``min_gradient``."""
+    tid = start + wp.tid()
+    first = tid * sample_count
+    count = int(0)
+    for n in range(sample_count):
+        if wp.abs(logit_grad[first + n]) > min_gradient:
+            count += 1
+    place = start * sample_count + wp.atomic_add(listed_count, count_index(slot), count)
+    for n in range(sample_count):
+        if wp.abs(logit_grad[first + n]) > min_gradient:
+            listed[place] = first + n
+            place += 1
+
+
+@wp.kernel(enable_backward=False)
 def composite_color(
     start: int,
     sample_count: int,
@@ -164,6 +233,8 @@ def surface_depth(
 @wp.kernel(enable_backward=False)
 def composite_backward(
     start: int,
+    slot: int,
+    listed_count: wp.array(dtype=int),
     sample_count: int,
     z: wp.array(dtype=float),
     keep: wp.array(dtype=int),
@@ -177,7 +248,10 @@ def composite_backward(
     logit_grad: wp.array(dtype=float),
     color_grad: wp.array(dtype=wp.vec3),
 ):
+    """Also empties the list that `list_steep` fills next."""
     tid = start + wp.tid()
+    if wp.tid() == 0:
+        listed_count[count_index(slot)] = 0
     first = tid * sample_count
     kept = keep[tid] != 0
     d_depth = depth_grad[tid]

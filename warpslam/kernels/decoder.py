@@ -13,9 +13,11 @@ vectorises over the outputs, and each row that is read serves all samples of the
 twice as large as a CPU's first cache; one sample at a time, the kernels wait for them and take 1.7 times as long. The
 adjoint uses the same rows of the transposed matrices.
 
-A forward launch covers some samples of each ray, and leaves out blocks of rays whose transmittance is spent. It keeps
-one bit per ReLU (5 words a sample and decoder); the adjoint kernels are written by hand, because the generated adjoint
-replays the forward and costs 4 to 16 times as much. They return
+A forward launch for occupancy covers some samples of each ray, and leaves out blocks of rays whose transmittance is
+spent. Colour and the adjoints work on lists of samples (``listed``, see `warpslam.kernels.compositing`), so that blocks
+are full although few samples of a ray count. Forward keeps one bit per ReLU (5 words a sample and decoder); the adjoint
+kernels are written by hand, because the generated adjoint replays the forward and costs 4 to 16 times as much. They
+return
 
     d_logit -> rows of the grid that are selected (``grid_grad``), the sample position (``point_grad``), and for the
     colour decoder the weights including B (``weight_grad``).
@@ -29,6 +31,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from warpslam.kernels.compositing import count_index
 from warpslam.kernels.grid import (
     Lattice,
     Vec32,
@@ -124,7 +127,8 @@ BLOCK_SIZE = {"cpu": 4, "cuda": 1}
 def decoder_kernels(target: str) -> SimpleNamespace:
     """Kernels of all decoders for ``target`` "cpu" or "cuda", in the Warp module ``warpslam.decoder_<target>``.
 
-    A launch over N samples has `thread_count(N)` threads and takes N as ``point_count``.
+    A launch over N samples has `thread_count(N)` threads and takes N as ``point_count``; one over a list of up to N
+    samples has as many.
     """
     size = BLOCK_SIZE[target]
     on_cpu = target == "cpu"
@@ -285,6 +289,29 @@ def decoder_kernels(target: str) -> SimpleNamespace:
             point = wp.min(size * thread + p, point_count - 1)
             samples[p] = sample_index(point, first_ray, first_sample, width, sample_count)
         return samples
+
+    @func
+    def wanted_of(thread: int, count: int) -> Indices:
+        """Which samples of a thread are on a list of ``count``: all but those behind its end."""
+        wanted = Indices()
+        for p in range(size):
+            wanted[p] = wp.where(size * thread + p < count, 1, 0)
+        return wanted
+
+    @func
+    def listed_samples(thread: int, count: int, start: int, listed: wp.array(dtype=int)) -> Indices:
+        """Samples of a thread on a list; the last one stands in for those behind its end."""
+        samples = Indices()
+        for p in range(size):
+            samples[p] = listed[start + wp.min(size * thread + p, count - 1)]
+        return samples
+
+    @func
+    def wanted_gradient(samples: Indices, wanted: Indices, logit_grad: wp.array(dtype=float)) -> Scalars:
+        d = Scalars()
+        for p in range(size):
+            d[p] = wp.where(wanted[p] != 0, logit_grad[samples[p]], 0.0)
+        return d
 
     @func
     def any_lit(
@@ -478,9 +505,10 @@ def decoder_kernels(target: str) -> SimpleNamespace:
 
     @kernel
     def geometry_backward(
-        point_count: int,
         start: int,
         slot: int,
+        listed: wp.array(dtype=int),
+        listed_count: wp.array(dtype=int),
         trips: int,
         sample_count: int,
         ray_origin: wp.array(dtype=wp.vec3),
@@ -493,7 +521,6 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         output_row: int,
         bits: wp.array2d(dtype=wp.uint32),
         logit_grad: wp.array(dtype=float),
-        min_gradient: float,
         want_grid: int,
         selected: wp.array(dtype=wp.uint8),
         grid_grad: wp.array2d(dtype=Vec32),
@@ -501,17 +528,13 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         point_grad: wp.array(dtype=wp.vec3),
     ):
         """Adjoint of `middle_forward` and of `fine_forward` (they differ in ``output_row``)."""
-        first = size * wp.tid()
-        samples = Indices()
-        wanted = Indices()
-        d = Scalars()
-        for p in range(size):
-            samples[p] = start + wp.min(first + p, point_count - 1)
-            if first + p < point_count and wp.abs(logit_grad[samples[p]]) > min_gradient:
-                wanted[p] = 1
-                d[p] = logit_grad[samples[p]]
-        if not any_wanted(wanted):
+        thread = wp.tid()
+        count = listed_count[count_index(slot)]
+        if size * thread >= count:
             return
+        samples = listed_samples(thread, count, start, listed)
+        wanted = wanted_of(thread, count)
+        d = wanted_gradient(samples, wanted, logit_grad)
         g = outer(d, W[output_row])
         dc = matvec(Block(), g, T, V_T + 128, trips)
         a = keep_active(g, bits, samples, 4)
@@ -550,37 +573,28 @@ def decoder_kernels(target: str) -> SimpleNamespace:
 
     @kernel
     def color_forward(
-        point_count: int,
-        first_ray: int,
-        first_sample: int,
-        width: int,
+        start: int,
+        slot: int,
+        listed: wp.array(dtype=int),
+        listed_count: wp.array(dtype=int),
         trips: int,
         sample_count: int,
         ray_origin: wp.array(dtype=wp.vec3),
         ray_direction: wp.array(dtype=wp.vec3),
         z: wp.array(dtype=float),
-        transmittance: wp.array(dtype=float),
-        min_transmittance: float,
         lattice: Lattice,
         features: wp.array(dtype=Vec32),
         W: wp.array(dtype=Vec32),
         bits: wp.array2d(dtype=wp.uint32),
         want_activations: int,
         activations: wp.array2d(dtype=Vec32),
-        weight: wp.array(dtype=float),
-        min_weight: float,
         color: wp.array(dtype=wp.vec3),
     ):
-        samples = block_samples(wp.tid(), point_count, first_ray, first_sample, width, sample_count)
-        if not any_lit(samples, sample_count, transmittance, min_transmittance):
+        thread = wp.tid()
+        count = listed_count[count_index(slot)]
+        if size * thread >= count:
             return
-        heavy = Indices()
-        for p in range(size):
-            heavy[p] = wp.where(weight[samples[p]] >= min_weight, 1, 0)
-        if not any_wanted(heavy):
-            for p in range(size):
-                color[samples[p]] = wp.vec3()
-            return
+        samples = listed_samples(thread, count, start, listed)
         positions = positions_of(samples, sample_count, ray_origin, ray_direction, z)
         c = look_up(positions, lattice, features)
         a0 = fill(W[BIAS])
@@ -614,14 +628,14 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         blue = output_of(h4, W[OUT_32 + 2])
         bias = W[OUT_32 + 3]
         for p in range(size):
-            shown = wp.vec3(red[p] + bias[0], green[p] + bias[1], blue[p] + bias[2])
-            color[samples[p]] = wp.where(heavy[p] != 0, shown, wp.vec3())
+            color[samples[p]] = wp.vec3(red[p] + bias[0], green[p] + bias[1], blue[p] + bias[2])
 
     @kernel
     def color_backward(
-        point_count: int,
         start: int,
         slot: int,
+        listed: wp.array(dtype=int),
+        listed_count: wp.array(dtype=int),
         trips: int,
         sample_count: int,
         ray_origin: wp.array(dtype=wp.vec3),
@@ -643,16 +657,19 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         weight_grad: wp.array2d(dtype=Vec32),
         layer_grad: wp.array2d(dtype=Vec32),
     ):
-        first = size * wp.tid()
-        samples = Indices()
+        thread = wp.tid()
+        count = listed_count[count_index(slot)]
+        if size * thread >= count:
+            return
+        samples = listed_samples(thread, count, start, listed)
         wanted = Indices()
         red = Scalars()
         green = Scalars()
         blue = Scalars()
         for p in range(size):
-            samples[p] = start + wp.min(first + p, point_count - 1)
             d = color_grad[samples[p]]
-            if first + p < point_count and (d[0] != 0.0 or d[1] != 0.0 or d[2] != 0.0):
+            # Rays without a residual have weighty samples, too.
+            if size * thread + p < count and (d[0] != 0.0 or d[1] != 0.0 or d[2] != 0.0):
                 wanted[p] = 1
                 red[p] = d[0]
                 green[p] = d[1]
@@ -785,9 +802,10 @@ def decoder_kernels(target: str) -> SimpleNamespace:
 
     @kernel
     def coarse_backward(
-        point_count: int,
         start: int,
         slot: int,
+        listed: wp.array(dtype=int),
+        listed_count: wp.array(dtype=int),
         trips: int,
         sample_count: int,
         ray_origin: wp.array(dtype=wp.vec3),
@@ -803,17 +821,13 @@ def decoder_kernels(target: str) -> SimpleNamespace:
     ):
         """Adjoint of `coarse_forward`; the coarse level serves mapping only, so the sample position gets no gradient.
         """
-        first = size * wp.tid()
-        samples = Indices()
-        wanted = Indices()
-        d = Scalars()
-        for p in range(size):
-            samples[p] = start + wp.min(first + p, point_count - 1)
-            if first + p < point_count and logit_grad[samples[p]] != 0.0:
-                wanted[p] = 1
-                d[p] = logit_grad[samples[p]]
-        if not any_wanted(wanted):
+        thread = wp.tid()
+        count = listed_count[count_index(slot)]
+        if size * thread >= count:
             return
+        samples = listed_samples(thread, count, start, listed)
+        wanted = wanted_of(thread, count)
+        d = wanted_gradient(samples, wanted, logit_grad)
         a = keep_active(outer(d, W[C_OUT]), bits, samples, 4)
         a = keep_active(matvec(Block(), a, T, C_W4, trips), bits, samples, 3)
         dc = matvec(Block(), a, T, C_C3, trips)

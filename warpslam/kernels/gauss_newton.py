@@ -13,7 +13,7 @@ has one order.
 
 import warp as wp
 
-from warpslam.kernels.compositing import OUTSIDE_LOGIT, occupancy
+from warpslam.kernels.compositing import OUTSIDE_LOGIT, count_index, occupancy
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -33,6 +33,8 @@ MAX_ROTATION = wp.constant(wp.float64(0.05))
 @wp.kernel
 def ray_derivatives(
     start: int,
+    slot: int,
+    listed_count: wp.array(dtype=int),
     sample_count: int,
     z: wp.array(dtype=float),
     inlier: wp.array(dtype=int),
@@ -45,8 +47,12 @@ def ray_derivatives(
     wanted: wp.array(dtype=float),
     color_grad: wp.array(dtype=wp.vec3),
 ):
-    """Derivatives of depth and grey value by each logit; ``wanted`` is 1 where one of them exceeds ``min_gradient``."""
+    """Derivatives of depth and grey value by each logit; ``wanted`` is 1 where one of them exceeds ``min_gradient``.
+    Also empties the list that `warpslam.kernels.compositing.list_steep` fills next.
+    """
     tid = start + wp.tid()
+    if wp.tid() == 0:
+        listed_count[count_index(slot)] = 0
     depth_behind = float(0.0)
     grey_behind = float(0.0)
     for m in range(sample_count):

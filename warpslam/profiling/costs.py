@@ -4,8 +4,7 @@ Operations are counted as `warpslam.complexity` counts them, two a weight and on
 sines, interpolation and compositing are left out, so that rates are a little too low rather than too high. An adjoint
 costs two operations a weight for the derivative by its inputs, and two for the derivative by the weights.
 
-Decoder kernels skip points: behind the surface, without weight, without gradient. (On the CPU they compute blocks of
-four where one is wanted; the others are no useful work and do not count.) On the CPU the points that are
+Decoder kernels skip points: behind the surface, without weight, without gradient. On the CPU the points that are
 computed are counted from the arrays the kernel is about to read; where that can't be done, all of them count and
 `Work.counted` says so.
 """
@@ -63,20 +62,27 @@ class Arguments:
         """Shape of an array."""
         return self._values[self._position[name]].shape
 
-    def floats(self, name: str, first: int, stop: int, components: int = 1) -> np.ndarray:
-        """Rows ``first`` to ``stop`` of a contiguous float array, float32 (rows, components), without a copy.
+    def floats(self, name: str, first: int, stop: int) -> np.ndarray:
+        """Entries ``first`` to ``stop`` of a contiguous float32 array, without a copy.
 
         Raises:
             KeyError: There is no such argument, or it lies on another device.
         """
+        return np.ctypeslib.as_array((ctypes.c_float * max(stop - first, 0)).from_address(self._address(name, first)))
+
+    def integer(self, name: str, index: int) -> int:
+        """An entry of a contiguous int32 array.
+
+        Raises:
+            KeyError: There is no such argument, or it lies on another device.
+        """
+        return ctypes.c_int32.from_address(self._address(name, index)).value
+
+    def _address(self, name: str, index: int) -> int:
         position = self._position[name]
         if not self._readable:
             raise KeyError(name)
-        rows = max(stop - first, 0)
-        address = self._values[position].data + 4 * components * first
-        return np.ctypeslib.as_array((ctypes.c_float * (rows * components)).from_address(address)).reshape(
-            rows, components
-        )
+        return self._values[position].data + 4 * index
 
 
 @cache
@@ -130,7 +136,7 @@ def _forward(level: str) -> Model:
     def work(threads: int, arguments: Arguments) -> Work:
         every = arguments.number("point_count")
         try:
-            points = _forward_points(every, arguments, level == "color")
+            points = _points_of_going_rays(every, arguments)
         except KeyError:
             return Work(every, each * every, counted=False)
         return Work(points, each * points)
@@ -138,22 +144,19 @@ def _forward(level: str) -> Model:
     return work
 
 
-def _forward_points(every: int, arguments: Arguments, weighted: bool) -> int:
-    """Samples on rays that are not spent yet, and for colour those that weigh something."""
+def _points_of_going_rays(every: int, arguments: Arguments) -> int:
+    """Samples on rays that are not spent yet."""
     first, width = arguments.number("first_ray"), arguments.number("width")
-    rays = every // width
-    transmittance = arguments.floats("transmittance", first, first + rays)
-    going = transmittance[:, 0] >= arguments.number("min_transmittance")
-    if not weighted:
-        return int(np.count_nonzero(going)) * width
-    count, sample = arguments.number("sample_count"), arguments.number("first_sample")
-    weight = arguments.floats("weight", first * count, (first + rays) * count).reshape(rays, count)
-    weight = weight[going, sample : sample + width]
-    return int(np.count_nonzero(weight >= arguments.number("min_weight")))
+    transmittance = arguments.floats("transmittance", first, first + every // width)
+    return int(np.count_nonzero(transmittance >= arguments.number("min_transmittance"))) * width
 
 
-def _backward(gradient: str, components: int, level: str | None = None) -> Model:
-    """Adjoint kernel that skips points whose ``gradient`` is not above "min_gradient" (0 if it has none)."""
+def _color_forward(threads: int, arguments: Arguments) -> Work:
+    return _listed(flops_per_point("color"), threads, arguments)
+
+
+def _backward(level: str | None = None) -> Model:
+    """Adjoint kernel over listed samples; for colour, those without a gradient are few and count."""
 
     def work(threads: int, arguments: Arguments) -> Work:
         each = backward_flops(
@@ -161,16 +164,20 @@ def _backward(gradient: str, components: int, level: str | None = None) -> Model
             points=bool(_optional(arguments, "want_point")),
             weights=bool(_optional(arguments, "want_weights")),
         )
-        every = arguments.number("point_count")
-        try:
-            start = arguments.number("start")
-            values = arguments.floats(gradient, start, start + every, components)
-            points = int(np.count_nonzero((np.abs(values) > _optional(arguments, "min_gradient")).any(axis=1)))
-        except KeyError:
-            return Work(every, each * every, counted=False)
-        return Work(points, each * points)
+        return _listed(each, threads, arguments)
 
     return work
+
+
+def _listed(each: int, threads: int, arguments: Arguments) -> Work:
+    """Work on the samples of a list; where its length can't be read, one a thread."""
+    from warpslam.kernels.compositing import COUNT_STRIDE
+
+    try:
+        points = arguments.integer("listed_count", COUNT_STRIDE * arguments.number("slot"))
+    except KeyError:
+        return Work(threads, each * threads, counted=False)
+    return Work(points, each * points)
 
 
 def _optional(arguments: Arguments, name: str) -> Any:
@@ -217,10 +224,11 @@ def _adam_rows(threads: int, arguments: Arguments) -> Work:
 
 
 _MODELS: dict[str, Model] = {
-    **{f"{level}_forward": _forward(level) for level in ("coarse", "middle", "fine", "color")},
-    "geometry_backward": _backward("logit_grad", 1),
-    "coarse_backward": _backward("logit_grad", 1, "coarse"),
-    "color_backward": _backward("color_grad", 3, "color"),
+    **{f"{level}_forward": _forward(level) for level in ("coarse", "middle", "fine")},
+    "color_forward": _color_forward,
+    "geometry_backward": _backward(),
+    "coarse_backward": _backward("coarse"),
+    "color_backward": _backward("color"),
     "color_weights": _sum_of_color_weights,
     "composite": _samples("width"),
     **{
@@ -229,6 +237,8 @@ _MODELS: dict[str, Model] = {
             "ray_variance",
             "composite_color",
             "composite_backward",
+            "list_weighty",
+            "list_steep",
             "surface_depth",
             "collect_ray_gradients",
             "ray_derivatives",
