@@ -16,7 +16,7 @@ than min_transmittance * z_max, and rgb by less than min_transmittance * the bri
 Per-sample arrays have shape (ray_count * sample_count,). Rays that are not kept render 0 and have no gradient.
 
 The samples that need colour, and those whose logit has a gradient, are listed: a launch over the rays from ``start`` on
-fills ``listed`` from ``start * sample_count`` on, and the entry of ``listed_count`` that `count_index` gives to its slot.
+fills ``listed`` from ``start * sample_count`` on, and the entry of ``listed_count`` that `count_index` gives its slot.
 """
 
 import warp as wp
