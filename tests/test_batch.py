@@ -249,12 +249,12 @@ def test_settings_are_refused_before_any_worker_starts(tmp_path):
 def test_summary_files(tmp_path):
     """A row a job; text from errors can't break the page."""
     statuses = [
-        JobStatus("a", "finished", 4, 4, 0.0123, 2.5, 61.04, 1, 512.4, "", 2),
+        JobStatus("a", "finished", 4, 4, 0.0123, 2.5, 61.04, 1, 512.4, "", 2, 3),
         JobStatus("b", "failed", message="<script>alert(1)</script>\nsecond line"),
     ]
     csv_path, html_path = write_summary(statuses, tmp_path)
     rows = list(csv.reader(csv_path.open()))
-    assert rows[1] == ["a", "finished (2 attempts)", "4/4", "1", "1.23", "2.50", "61.0", "512", ""]
+    assert rows[1] == ["a", "finished (2 attempts, resumed after 3 frames)", "4/4", "1", "1.23", "2.50", "61.0", "512", ""]
     assert rows[2][-1] == "<script>alert(1)</script>"
     page = html_path.read_text()
     assert "1 of 2 sequences done" in page and "<script>" not in page and "&lt;script&gt;" in page

@@ -1,7 +1,8 @@
 """Many sequences: what is to be done, what has been done, and worker processes that do it on one machine.
 
 Every sequence has a folder of its own with the results of its run and a small state file. Running the same batch again
-skips what is finished with the same settings and does the rest. `warpslam.cluster` runs the same jobs on Ray.
+skips what is finished with the same settings and does the rest; a sequence that was begun goes on from its last
+checkpoint. `warpslam.cluster` runs the same jobs on Ray.
 """
 
 from __future__ import annotations
@@ -81,7 +82,8 @@ class JobStatus:
 
     status: "waiting", "running", "done before", "finished", "failed", "out of memory", "interrupted" or "crashed".
     done, total: Frames. ate_rmse: So far, or of the end [m]. fps: Frames a second. seconds: Time it took.
-    message: Why it is not finished. attempt: From 1; more than 1 if a worker was lost.
+    message: Why it is not finished, or why it could not go on from its checkpoint. attempt: From 1; more than 1 if a
+    worker was lost. resumed_after: Frames that were taken over from a checkpoint.
     """
 
     name: str
@@ -95,6 +97,7 @@ class JobStatus:
     peak_memory_mib: float | None = None
     message: str = ""
     attempt: int = 0
+    resumed_after: int = 0
 
 
 Update = Callable[[JobStatus], None]
@@ -370,6 +373,7 @@ def ended_status(job: Job, output: Path, known: JobStatus) -> JobStatus:
         fps=metrics.get("fps"),
         lost=frames.get("LOST", 0),
         peak_memory_mib=metrics.get("peak_memory_mib"),
+        resumed_after=metrics.get("resumed_after", 0),
     )
 
 

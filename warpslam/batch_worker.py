@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from warpslam.batch import FAILED, FINISHED, INTERRUPTED, MEMORY, RUNNING, BatchState, Job
 from warpslam.errors import MemoryBudgetError, WarpSlamError
+from warpslam.resume import remove_checkpoints
+from warpslam.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from warpslam.pipeline import Progress
@@ -48,7 +50,8 @@ def _print(news: dict[str, Any]) -> None:
 
 
 def execute(job: Job, output: Path, report: Report, memory_gb: float | None = None, *, slot: int = 0) -> str:
-    """Run a job and keep its state file; returns its status.
+    """Run a job and keep its state file; returns its status. A job that was begun with the same settings goes on from
+    its last checkpoint.
 
     Args:
         job: The job.
@@ -60,7 +63,11 @@ def execute(job: Job, output: Path, report: Report, memory_gb: float | None = No
     """
     start = time.monotonic()
     state = BatchState.of(job, output)
-    if state.fields.get("settings") != job.settings_hash or state.fields.get("status") != RUNNING:
+    has_same_settings = state.fields.get("settings") == job.settings_hash
+    if not has_same_settings:
+        # Before the state file says otherwise: the next process would take them for its own.
+        remove_checkpoints(RunFolder(output / job.name))
+    if not has_same_settings or state.fields.get("status") != RUNNING:
         state.fields.clear()
     elif state.fields.get("ending") == MEMORY:
         # Where the process before this one was ended, another one would be too.
@@ -72,7 +79,7 @@ def execute(job: Job, output: Path, report: Report, memory_gb: float | None = No
     watch = MemoryWatch(memory_gb, state, start)
     status, message = FAILED, ""
     try:
-        status, message = _run(job, output / job.name, report, watch, slot), ""
+        status, message = _run(job, output / job.name, report, watch, slot)
     except MemoryBudgetError as error:
         status, message = MEMORY, str(error)
     except WarpSlamError as error:
@@ -88,7 +95,8 @@ def execute(job: Job, output: Path, report: Report, memory_gb: float | None = No
     return status
 
 
-def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) -> str:
+def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) -> tuple[str, str]:
+    """Status and message."""
     from warpslam.config import Config
     from warpslam.evaluation import load_mesh
     from warpslam.method import has_checkpoints
@@ -112,9 +120,11 @@ def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) 
     result = run(
         sequence, config, folder, frames=slice(*job.frames), device=device, seed=job.seed, source=source,
         truth_mesh=truth_mesh, on_frame=on_frame, method=job.method, poses=job.poses,
-        checkpoint_every=job.checkpoint_every if has_checkpoints(job.method) else None,
+        checkpoint_every=job.checkpoint_every if has_checkpoints(job.method) else None, go_on=True,
     )  # fmt: skip
-    return INTERRUPTED if result.status == "interrupted" else FINISHED
+    message = result.metrics.get("started_anew", "")
+    message = f"started from the beginning: {message}" if message else ""
+    return INTERRUPTED if result.status == "interrupted" else FINISHED, message
 
 
 def _device_of(slot: int) -> str | None:

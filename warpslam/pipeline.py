@@ -42,6 +42,7 @@ from warpslam.resume import (
     RunProgress,
     RunRequest,
     SavedRun,
+    find_checkpoint,
     frame_digest,
     remove_checkpoints,
     write_checkpoint,
@@ -115,6 +116,7 @@ def run(
     map_path: str | Path | None = None,
     localize_only: bool = False,
     saved: SavedRun | None = None,
+    go_on: bool = False,
     check_input: bool = True,
 ) -> RunResult:
     """Run SLAM over a sequence and write a run folder.
@@ -133,11 +135,13 @@ def run(
         method: One of `warpslam.method.METHODS`.
         poses: Trajectory in the TUM format whose poses are given to the method in place of the sequence's own; frames
             without one are left out. Errors are against the sequence's own as ever.
-        checkpoint_every: Frames between two checkpoints; None for none. The schedule has to be deterministic for a
-            resumed run to give the same bytes.
+        checkpoint_every: Frames between two checkpoints; None for none. With the schedule strict a resumed run gives
+            the same bytes as one that was never stopped; with overlapped it gives a result as good as any other run's.
         map_path: Map to start from, a file that `Slam.save` wrote; the first frame is looked for in it.
         localize_only: The map is left as it is.
         saved: Checkpoint of the run in ``output``, which goes on from there; all else must be as it was.
+        go_on: Go on from the last checkpoint in ``output``, where there is one of this very run; where it is of no use,
+            a warning says why, and the run starts from the beginning.
         check_input: Refuse an input that `warpslam.checking` finds can't work; its warnings are logged in any case.
 
     Raises:
@@ -159,11 +163,15 @@ def run(
         dataclasses.asdict(source) if source is not None else None,
         str(poses) if poses is not None else None,
     )
+    why_anew = ""
+    if go_on and saved is None and output is not None:
+        saved, why_anew = find_checkpoint(RunFolder(output), request, sequence)
+    elif saved is not None:
+        saved.check(request, sequence)
     if saved is None:
         folder = RunFolder.create(output, sequence.name)
     else:
         assert output is not None
-        saved.check(request, sequence)
         folder = RunFolder(output)
         folder.clear_results()
     with _log_file(folder.log, append=saved is not None):
@@ -174,6 +182,9 @@ def run(
         run_.request, run_.checkpoint_every, run_.check_input = request, checkpoint_every, check_input
         if saved is not None:
             run_.go_on_from(saved)
+        elif why_anew:
+            run_.metrics["started_anew"] = why_anew
+            log.warning("starting from the beginning: %s", why_anew)
         return run_.execute()
 
 
@@ -228,6 +239,7 @@ class _Run:
         self.seconds.update(progress.seconds)
         self.digests = progress.digests
         self.resumed_count = len(progress.results)
+        self.metrics["resumed_after"] = progress.position
 
     def execute(self) -> RunResult:
         self.start = time.perf_counter()
