@@ -141,7 +141,7 @@ def _compile(device: str | None) -> None:
 
     from warpslam.compilation import compile_kernels
     from warpslam.output import kernel_cache_errors
-    from warpslam.pipeline import check_device
+    from warpslam.run_setup import check_device
 
     check_device(device)
     with kernel_cache_errors():

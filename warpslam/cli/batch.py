@@ -15,7 +15,6 @@ from warpslam.cli.common import (
     add_command,
     add_method_option,
     add_run_options,
-    duration,
     parse_frames,
 )
 
@@ -164,6 +163,8 @@ def _table(statuses: Sequence[JobStatus]) -> Any:
 
 def _print_table(statuses: Sequence[JobStatus]) -> None:
     from rich.console import Console
+
+    from warpslam.report.text import duration
 
     # Where there is no terminal rich assumes 80 columns, which would fold every cell.
     Console(width=None if sys.stdout.isatty() else 160).print(_table(statuses))

@@ -118,9 +118,3 @@ def quiet_warp() -> None:
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
-
-
-def duration(seconds: float) -> str:
-    """Seconds as text."""
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest} s" if minutes else f"{seconds:.1f} s"

@@ -15,7 +15,6 @@ from warpslam.cli.common import (
     add_method_option,
     add_run_options,
     add_sequence_options,
-    duration,
     print_reconstruction,
     print_rendering,
     quiet_warp,
@@ -228,6 +227,8 @@ def _compiling(module: ModuleProgress) -> str:
 
 
 def _print_line(progress: Progress) -> None:
+    from warpslam.report.text import duration
+
     every = max(1, progress.total // _PLAIN_LINES)
     if progress.done % every == 0 or progress.done in (1, progress.total):
         left = (progress.total - progress.done) / progress.fps
@@ -245,6 +246,8 @@ def _figures(progress: Progress) -> str:
 
 
 def _print_summary(result: RunResult) -> None:
+    from warpslam.report.text import duration
+
     metrics = result.metrics
     frames, seconds = metrics["frames"], metrics["seconds"]
     counts = ", ".join(f"{frames[name]} {name}" for name in ("OK", "LOST", "SKIPPED", "unreadable") if frames[name])
