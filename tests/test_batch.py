@@ -277,6 +277,22 @@ def test_command(tmp_path, capsys):
     assert (out / "summary.csv").is_file()
 
 
+@pytest.mark.parametrize(
+    ("options", "method", "every"),
+    [
+        ([], "nice-slam", 50),
+        (["--checkpoint-every", "7", "--method", "imap"], "imap", 7),
+        (["--checkpoint-every", "0"], "nice-slam", None),
+    ],
+)
+def test_command_names_method_and_checkpoints(tmp_path, monkeypatch, options, method, every):
+    """Checkpoints are written unless they are switched off, and the method is the option's."""
+    found = []
+    monkeypatch.setattr(batch, "run_batch", lambda jobs, output, **keywords: found.extend(jobs) or [])
+    assert cli.main(["batch", str(tmp_path), "-o", str(tmp_path / "out"), *options]) == 0
+    assert [(job.method, job.checkpoint_every) for job in found] == [(method, every)]
+
+
 def test_table_on_a_terminal(tmp_path, monkeypatch):
     """On a terminal a table is kept up to date, and ends as the summary."""
     import io

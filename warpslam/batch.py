@@ -2,7 +2,7 @@
 
 Every sequence has a folder of its own with the results of its run and a small state file. Running the same batch again
 skips what is finished with the same settings and does the rest; a sequence that was begun goes on from its last
-checkpoint. `warpslam.cluster` runs the same jobs on Ray.
+checkpoint, or starts again where its method has none. `warpslam.cluster` runs the same jobs on Ray.
 """
 
 from __future__ import annotations

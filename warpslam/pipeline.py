@@ -16,7 +16,7 @@ import numpy as np
 from warpslam.checking import ERROR, OK, check_sequence
 from warpslam.errors import ConfigError, DatasetError
 from warpslam.evaluation import AteResult, ReconstructionResult, ate
-from warpslam.method import DEFAULT_METHOD
+from warpslam.method import DEFAULT_METHOD, has_checkpoints
 from warpslam.output import kernel_cache_errors, log_file, output_error
 from warpslam.resume import (
     RunProgress,
@@ -155,7 +155,7 @@ def run(
         str(poses) if poses is not None else None,
     )
     why_anew = ""
-    if go_on and saved is None and output is not None:
+    if go_on and has_checkpoints(method) and saved is None and output is not None:
         saved, why_anew = find_checkpoint(RunFolder(output), request, sequence)
     elif saved is not None:
         saved.check(request, sequence)
