@@ -13,7 +13,7 @@ from warpslam.errors import DatasetError
 from warpslam.run_folder import RunFolder, write_json
 
 
-def fake_run(job, folder: Path, report, watch, slot: int) -> str:
+def fake_run(job, folder: Path, report, watch, slot: int) -> tuple[str, str]:
     """In place of `batch_worker._run`."""
     if "compiling" in job.name:
         time.sleep(0.5)
@@ -43,7 +43,7 @@ def fake_run(job, folder: Path, report, watch, slot: int) -> str:
     run.trajectory.write_text("# timestamp tx ty tz qx qy qz qw\n")
     frames = {"selected": 4, "processed": 4, "unreadable": 0, "LOST": 1}
     write_json(run.metrics, {"status": "finished", "frames": frames, "fps": 2.0, "ate_m": {"aligned": {"rmse": 0.03}}})
-    return FINISHED
+    return FINISHED, ""
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@
 
 kills itself (SIGKILL) when POINT is reached for the COUNT-th time: "map" (a frame), "write" (before a
 checkpoint is on the disk), "rename" (of a checkpoint), "refine" (after the last frame); "never" lets it run.
+Without ARGUMENTS it is a worker of a batch.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from warpslam import cli, pipeline
+from warpslam import batch_worker, cli, pipeline
 from warpslam.mapper import Mapper
 
 
@@ -34,7 +35,7 @@ def kill_at(owner: Any, name: str, count: int) -> None:
     setattr(owner, name, counted)
 
 
-def main() -> int:
+def main() -> int | None:
     point, count, arguments = sys.argv[1], int(sys.argv[2]), sys.argv[3:]
     targets = {
         "map": (Mapper, "start_frame"),
@@ -45,7 +46,7 @@ def main() -> int:
     if point != "never":
         kill_at(*targets[point], count)
     pipeline._Run._draw_plots = lambda self: None  # figures take longer than all else
-    return cli.main(arguments)
+    return cli.main(arguments) if arguments else batch_worker.main()
 
 
 if __name__ == "__main__":

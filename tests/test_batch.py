@@ -169,6 +169,25 @@ def test_manifest(tmp_path):
     assert Job.from_dict(second.to_dict()) == second
 
 
+def test_manifest_names_methods_poses_and_checkpoints(tmp_path):
+    """Method, given poses (relative to the file) and checkpoints, of all sequences or of one; 0 is for none."""
+    text = """
+    defaults: {method: tsdf, poses: poses.tum, checkpoint_every: 7}
+    sequences: [a, {path: b, method: nice-slam, checkpoint_every: 0}]
+    """
+    (tmp_path / "m.yaml").write_text(text)
+    first, second = read_manifest(tmp_path / "m.yaml", replace(COMMON, checkpoint_every=50))
+    assert (first.method, first.poses, first.checkpoint_every) == ("tsdf", str(tmp_path / "poses.tum"), 7)
+    assert (second.method, second.checkpoint_every) == ("nice-slam", None)
+
+
+def test_checkpoints_do_not_decide_on_the_result():
+    """A batch with other checkpoints is still the same batch; one with another method or other poses is not."""
+    job = Job("a", "/a")
+    assert replace(job, checkpoint_every=5).settings_hash == job.settings_hash
+    assert len({j.settings_hash for j in (job, replace(job, method="tsdf"), replace(job, poses="/p"))}) == 3
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -215,6 +234,8 @@ def test_settings_are_refused_before_any_worker_starts(tmp_path):
     bad = [
         ([replace(jobs("a")[0], overrides=("mapping.window=0",))], {}, "mapping.window"),
         ([replace(jobs("a")[0], preset="fast")], {}, "preset 'fast'"),
+        ([jobs("b")[0], replace(jobs("a")[0], method="orb")], {}, "method 'orb' is unknown"),
+        ([replace(jobs("a")[0], checkpoint_every=-1)], {}, "checkpoint_every = -1 of a"),
         ([], {}, "the batch is empty"),
         (jobs("a"), {"workers": 0}, "workers = 0"),
         (jobs("a"), {"memory_gb": 0.0}, "memory_gb"),
@@ -228,12 +249,13 @@ def test_settings_are_refused_before_any_worker_starts(tmp_path):
 def test_summary_files(tmp_path):
     """A row a job; text from errors can't break the page."""
     statuses = [
-        JobStatus("a", "finished", 4, 4, 0.0123, 2.5, 61.04, 1, 512.4, "", 2),
+        JobStatus("a", "finished", 4, 4, 0.0123, 2.5, 61.04, 1, 512.4, "", 2, 3),
         JobStatus("b", "failed", message="<script>alert(1)</script>\nsecond line"),
     ]
     csv_path, html_path = write_summary(statuses, tmp_path)
     rows = list(csv.reader(csv_path.open()))
-    assert rows[1] == ["a", "finished (2 attempts)", "4/4", "1", "1.23", "2.50", "61.0", "512", ""]
+    assert rows[1][:2] == ["a", "finished (2 attempts, resumed after 3 frames)"]
+    assert rows[1][2:] == ["4/4", "1", "1.23", "2.50", "61.0", "512", ""]
     assert rows[2][-1] == "<script>alert(1)</script>"
     page = html_path.read_text()
     assert "1 of 2 sequences done" in page and "<script>" not in page and "&lt;script&gt;" in page
@@ -253,6 +275,22 @@ def test_command(tmp_path, capsys):
     assert cli.main(["batch", str(tmp_path / "good"), *options]) == 0
     assert "good: done before" in capsys.readouterr().out
     assert (out / "summary.csv").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "method", "every"),
+    [
+        ([], "nice-slam", 50),
+        (["--checkpoint-every", "7", "--method", "imap"], "imap", 7),
+        (["--checkpoint-every", "0"], "nice-slam", None),
+    ],
+)
+def test_command_names_method_and_checkpoints(tmp_path, monkeypatch, options, method, every):
+    """Checkpoints are written unless they are switched off, and the method is the option's."""
+    found = []
+    monkeypatch.setattr(batch, "run_batch", lambda jobs, output, **keywords: found.extend(jobs) or [])
+    assert cli.main(["batch", str(tmp_path), "-o", str(tmp_path / "out"), *options]) == 0
+    assert [(job.method, job.checkpoint_every) for job in found] == [(method, every)]
 
 
 def test_table_on_a_terminal(tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -58,8 +59,9 @@ def test_without_ray(monkeypatch, tmp_path, capsys):
 
 @pytest.mark.slow  # starts three Ray daemons and runs three sequences
 def test_lost_worker_is_replaced(tmp_path, monkeypatch):
-    """Two machines, two sequences, one worker killed in the middle: both finish, one of them at the second attempt
-    and with the same trajectory as on this machine, and a second batch has nothing to do.
+    """Two machines, two sequences, one worker killed in the middle: both finish, one of them at the second attempt,
+    from its last checkpoint on and with the same trajectory and mesh as on this machine, and a second batch has
+    nothing to do.
     """
     ray = pytest.importorskip("ray", reason="the package ray is not installed")
     from ray.cluster_utils import Cluster
@@ -70,11 +72,12 @@ def test_lost_worker_is_replaced(tmp_path, monkeypatch):
     for seed in (1, 2):
         write_replica(SyntheticSequence(seed, 6, intrinsics=camera, device="cpu"), tmp_path / f"room{seed}")
         job = Job(f"room{seed}", str(tmp_path / f"room{seed}"), preset="default", overrides=SMALL, device="cpu")
+        job = replace(job, checkpoint_every=2)
         jobs.append(job)
     output, killed = tmp_path / "out", []
 
     def on_update(status):
-        if status.name == "room1" and status.done >= 2 and not killed:
+        if status.name == "room1" and status.done >= 3 and not killed:
             killed.append(BatchState.of(jobs[0], output).fields["pid"])
             os.kill(killed[0], signal.SIGKILL)
 
@@ -86,6 +89,7 @@ def test_lost_worker_is_replaced(tmp_path, monkeypatch):
         statuses = run_on_ray(jobs, output, workers=2, on_update=on_update)
         assert killed and [(s.status, s.attempt) for s in statuses] == [("finished", 2), ("finished", 1)]
         assert [s.done for s in statuses] == [6, 6]
+        assert [s.resumed_after >= 2 for s in statuses] == [True, False]
         assert BatchState.of(jobs[0], output).fields["pid"] != killed[0]
         assert [s.status for s in run_on_ray(jobs, output)] == ["done before"] * 2
     finally:
@@ -94,5 +98,6 @@ def test_lost_worker_is_replaced(tmp_path, monkeypatch):
     monkeypatch.setenv("WARPSLAM_THREADS", "1")
     (local,) = run_batch(jobs[:1], tmp_path / "local")
     assert local.status == "finished"
-    same = [(folder / "room1" / "trajectory.tum").read_bytes() for folder in (output, tmp_path / "local")]
-    assert same[0] == same[1]
+    for name in ("trajectory.tum", "mesh.ply"):
+        same = [(folder / "room1" / name).read_bytes() for folder in (output, tmp_path / "local")]
+        assert same[0] == same[1], name

@@ -84,8 +84,12 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
     assert timing["frames"][2] == {"index": 2, "tracking": 0.25, "mapping": 0.5}
     frames = read_json(folder.frame_records)
     assert frames["left_out"] == [] and frames["frames"][2] == {
-        "index": 2, "timestamp": 2 / 30, "status": "OK", "message": "", "inliers": 0.9, "losses": {"loss": 1.5},
+        "index": 2, "timestamp": 2 / 30, "status": "OK", "message": "", "inliers": 0.9, "depth_error": 0.02,
+        "losses": {"loss": 1.5},
     }  # fmt: skip
+    table = folder.frames.read_text().splitlines()
+    assert table[0] == "frame,timestamp,status,inliers,depth_error_m,message" and len(table) == 9
+    assert table[3] == "2,0.066667,OK,0.9000,0.02000,"
     panels = load_panels(folder.panel_images)
     assert [panel.index for panel in panels] == [0, 2, 5, 7] and panels[1].rgb[0, 0].tolist() == [42, 42, 42]
     assert panels[0].rendered_depth[0, 0] == pytest.approx(2.03, abs=1e-3)

@@ -87,6 +87,7 @@ def test_killed_run_is_resumed_to_the_same_bytes(recording, uninterrupted, tmp_p
     assert cli.main(["run", "--resume", str(tmp_path)]) == 0
     assert_same(tmp_path, uninterrupted)
     assert f"after {position} frames" in (tmp_path / "log.txt").read_text()
+    assert "overlapped" not in capsys.readouterr().err
     metrics = read_json(tmp_path / "metrics.json")
     assert metrics["frames"]["processed"] == FRAMES - 1 and metrics["frames"]["unreadable"] == 1
     assert len(read_json(tmp_path / "timing.json")["frames"]) == FRAMES - 1
@@ -186,6 +187,22 @@ def test_changed_input_is_refused(stopped, recording, capsys):
     finally:
         first.write_bytes(content)
     assert "frame 0 of" in capsys.readouterr().err
+
+
+def test_overlapped_run_goes_on_with_a_weaker_promise(recording, tmp_path, capsys):
+    """With the schedule overlapped a stopped run goes on from a whole map and is finished; that it is not the same to
+    the bit is said. Nothing is said where the schedule is strict.
+    """
+    overlapped = [*arguments(recording, tmp_path), "--set", "schedule=overlapped"]
+    assert start("map", 3, overlapped).wait() == -signal.SIGKILL
+    assert cli.main(["run", "--resume", str(tmp_path)]) == 0
+    assert "with schedule=strict it would be the same" in capsys.readouterr().err
+    metrics = read_json(tmp_path / "metrics.json")
+    assert metrics["resumed_after"] >= 2 and metrics["frames"]["processed"] == FRAMES - 1
+    saved = Slam.load(RunFolder(tmp_path).map, "cpu")
+    assert len(saved.trajectory.poses) == FRAMES - 1 and len(read_tum(tmp_path / "trajectory.tum")[0]) == FRAMES - 1
+    assert [keyframe.index for keyframe in saved.keyframes] == sorted({key.index for key in saved.keyframes})
+    assert np.isfinite(saved.trajectory.poses).all() and (tmp_path / "mesh.ply").exists()
 
 
 def test_nothing_to_resume_is_said(uninterrupted, tmp_path, capsys):

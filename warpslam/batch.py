@@ -1,7 +1,8 @@
 """Many sequences: what is to be done, what has been done, and worker processes that do it on one machine.
 
 Every sequence has a folder of its own with the results of its run and a small state file. Running the same batch again
-skips what is finished with the same settings and does the rest. `warpslam.cluster` runs the same jobs on Ray.
+skips what is finished with the same settings and does the rest; a sequence that was begun goes on from its last
+checkpoint, or starts again where its method has none. `warpslam.cluster` runs the same jobs on Ray.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from typing import Any
 
 from warpslam import __version__
 from warpslam.errors import ConfigError, DatasetError
+from warpslam.method import DEFAULT_METHOD, check_method
 from warpslam.run_folder import RunFolder, as_file_name, read_json, write_json
 
 STATE_FILE = "batch.json"
@@ -37,7 +39,9 @@ _POLL_SECONDS = 0.2
 class Job:
     """One sequence of a batch and how it is run; fields as the options of ``warpslam run``.
 
-    name: Of the folder for its results. frames: Slice as (start, stop, step).
+    name: Of the folder for its results. frames: Slice as (start, stop, step). poses: Trajectory in the TUM format that
+    is taken as given. checkpoint_every: Frames between two checkpoints; None for none. A method that has none starts
+    again after a stop.
     """
 
     name: str
@@ -51,11 +55,15 @@ class Job:
     device: str | None = None
     seed: int = 0
     truth_mesh: str | None = None
+    method: str = DEFAULT_METHOD
+    poses: str | None = None
+    checkpoint_every: int | None = None
 
     @property
     def settings_hash(self) -> str:
-        """Of all that decides on the result: the fields and the version of warpslam."""
-        text = json.dumps({**asdict(self), "warpslam": __version__}, sort_keys=True)
+        """Of all that decides on the result: the version of warpslam and the fields, but for the checkpoints."""
+        fields = {name: value for name, value in asdict(self).items() if name != "checkpoint_every"}
+        text = json.dumps({**fields, "warpslam": __version__}, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def to_dict(self) -> dict[str, Any]:
@@ -74,7 +82,8 @@ class JobStatus:
 
     status: "waiting", "running", "done before", "finished", "failed", "out of memory", "interrupted" or "crashed".
     done, total: Frames. ate_rmse: So far, or of the end [m]. fps: Frames a second. seconds: Time it took.
-    message: Why it is not finished. attempt: From 1; more than 1 if a worker was lost.
+    message: Why it is not finished, or why it could not go on from its checkpoint. attempt: From 1; more than 1 if a
+    worker was lost. resumed_after: Frames that were taken over from a checkpoint.
     """
 
     name: str
@@ -88,6 +97,7 @@ class JobStatus:
     peak_memory_mib: float | None = None
     message: str = ""
     attempt: int = 0
+    resumed_after: int = 0
 
 
 Update = Callable[[JobStatus], None]
@@ -142,13 +152,16 @@ def check_jobs(jobs: Sequence[Job]) -> None:
     """Refuse settings that can't work before any worker starts. A folder that can't be read only fails its own job.
 
     Raises:
-        ConfigError: A preset, a setting or a number of the batch is not usable.
+        ConfigError: A method, a preset, a setting or a number of the batch is not usable.
     """
     from warpslam.config import PRESETS, Config
 
     if not jobs:
         raise ConfigError("the batch is empty: name folders, or a manifest with --manifest")
     for job in jobs:
+        check_method(job.method)
+        if job.checkpoint_every is not None and job.checkpoint_every < 1:
+            raise ConfigError(f"checkpoint_every = {job.checkpoint_every} of {job.name} must be at least 1 frame")
         Config.from_preset(job.preset or next(iter(PRESETS)), list(job.overrides))
 
 
@@ -360,6 +373,7 @@ def ended_status(job: Job, output: Path, known: JobStatus) -> JobStatus:
         fps=metrics.get("fps"),
         lost=frames.get("LOST", 0),
         peak_memory_mib=metrics.get("peak_memory_mib"),
+        resumed_after=metrics.get("resumed_after", 0),
     )
 
 

@@ -24,9 +24,12 @@ tr.bad td:nth-child(2) { color: #b00020; font-weight: 600 }
 
 def cells(status: JobStatus) -> tuple[str, ...]:
     """A row as text, in the order of `COLUMNS`; empty where there is no figure."""
+    notes = [f"{status.attempt} attempts"] if status.attempt > 1 else []
+    if status.resumed_after:
+        notes.append(f"resumed after {status.resumed_after} frames")
     return (
         status.name,
-        status.status + (f" ({status.attempt} attempts)" if status.attempt > 1 else ""),
+        status.status + (f" ({', '.join(notes)})" if notes else ""),
         f"{status.done}/{status.total}" if status.total else "",
         str(status.lost) if status.total else "",
         _figure(None if status.ate_rmse is None else 100 * status.ate_rmse, 2),

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from warpslam.batch import FAILED, FINISHED, INTERRUPTED, MEMORY, RUNNING, BatchState, Job
 from warpslam.errors import MemoryBudgetError, WarpSlamError
+from warpslam.resume import remove_checkpoints
+from warpslam.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from warpslam.pipeline import Progress
@@ -48,7 +50,8 @@ def _print(news: dict[str, Any]) -> None:
 
 
 def execute(job: Job, output: Path, report: Report, memory_gb: float | None = None, *, slot: int = 0) -> str:
-    """Run a job and keep its state file; returns its status.
+    """Run a job and keep its state file; returns its status. A job that was begun with the same settings goes on from
+    its last checkpoint.
 
     Args:
         job: The job.
@@ -60,7 +63,11 @@ def execute(job: Job, output: Path, report: Report, memory_gb: float | None = No
     """
     start = time.monotonic()
     state = BatchState.of(job, output)
-    if state.fields.get("settings") != job.settings_hash or state.fields.get("status") != RUNNING:
+    has_same_settings = state.fields.get("settings") == job.settings_hash
+    if not has_same_settings:
+        # Before the state file says otherwise: the next process would take them for its own.
+        remove_checkpoints(RunFolder(output / job.name))
+    if not has_same_settings or state.fields.get("status") != RUNNING:
         state.fields.clear()
     elif state.fields.get("ending") == MEMORY:
         # Where the process before this one was ended, another one would be too.
@@ -72,7 +79,7 @@ def execute(job: Job, output: Path, report: Report, memory_gb: float | None = No
     watch = MemoryWatch(memory_gb, state, start)
     status, message = FAILED, ""
     try:
-        status, message = _run(job, output / job.name, report, watch, slot), ""
+        status, message = _run(job, output / job.name, report, watch, slot)
     except MemoryBudgetError as error:
         status, message = MEMORY, str(error)
     except WarpSlamError as error:
@@ -88,9 +95,11 @@ def execute(job: Job, output: Path, report: Report, memory_gb: float | None = No
     return status
 
 
-def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) -> str:
+def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) -> tuple[str, str]:
+    """Status and message."""
     from warpslam.config import Config
     from warpslam.evaluation import load_mesh
+    from warpslam.method import has_checkpoints
     from warpslam.pipeline import run
     from warpslam.revisit import open_source
     from warpslam.run_folder import Source
@@ -98,8 +107,7 @@ def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) 
     source = Source(job.path, job.dataset, job.camera)
     sequence = open_source(source)
     config = Config.from_preset(job.preset or sequence.preset, list(job.overrides))
-    if job.decoders:
-        config = config.model_copy(update={"decoders": job.decoders})
+    config = config.with_files(job.decoders, job.poses)
     truth_mesh = load_mesh(job.truth_mesh) if job.truth_mesh else None
     device = job.device or _device_of(slot)
     _compile(device)
@@ -111,9 +119,12 @@ def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) 
 
     result = run(
         sequence, config, folder, frames=slice(*job.frames), device=device, seed=job.seed, source=source,
-        truth_mesh=truth_mesh, on_frame=on_frame,
+        truth_mesh=truth_mesh, on_frame=on_frame, method=job.method, poses=job.poses,
+        checkpoint_every=job.checkpoint_every if has_checkpoints(job.method) else None, go_on=True,
     )  # fmt: skip
-    return INTERRUPTED if result.status == "interrupted" else FINISHED
+    message = result.metrics.get("started_anew", "")
+    message = f"started from the beginning: {message}" if message else ""
+    return INTERRUPTED if result.status == "interrupted" else FINISHED, message
 
 
 def _device_of(slot: int) -> str | None:
@@ -130,7 +141,7 @@ def _compile(device: str | None) -> None:
 
     from warpslam.compilation import compile_kernels
     from warpslam.output import kernel_cache_errors
-    from warpslam.pipeline import check_device
+    from warpslam.run_setup import check_device
 
     check_device(device)
     with kernel_cache_errors():

@@ -1,7 +1,7 @@
 """The jobs of a batch on a Ray cluster, one task a sequence; Ray is the optional extra ``warpslam[cluster]``.
 
 Sequences and the output folder have to be reachable under the same paths on every machine (a shared file system). A
-task whose worker or machine is lost is started again elsewhere; what it had computed is computed again.
+task whose worker or machine is lost is started again elsewhere, where it goes on from its last checkpoint.
 """
 
 from __future__ import annotations

@@ -85,3 +85,20 @@ class LogFile(logging.FileHandler):
             super().close()
         except OSError as error:
             log.warning("%s: the last lines can't be written (%s)", self.baseFilename, error.strerror)
+
+
+@contextmanager
+def log_file(path: Path, *, append: bool = False) -> Iterator[None]:
+    """Send everything that warpslam logs, from INFO up, to a file as well."""
+    logger = logging.getLogger("warpslam")
+    handler = LogFile(path, logger, append=append)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    level = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+        logger.removeHandler(handler)
+        handler.close()

@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import logging
-import os
-import platform
-import sys
-import tempfile
 import time
-from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,48 +14,48 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warpslam.checking import ERROR, OK, check_sequence
-from warpslam.errors import ConfigError, DatasetError, InputError, MeshError, WarpSlamError
-from warpslam.evaluation import (
-    DEFAULT_PROTOCOL,
-    AteResult,
-    ReconstructionResult,
-    associate,
-    ate,
-    evaluate_mesh,
-    read_tum,
-    reconstruction_metrics,
-    rendering_metrics,
-    trajectory_metrics,
-    write_tum,
-)
-from warpslam.method import DEFAULT_METHOD, build_method, load_method
-from warpslam.output import LogFile, kernel_cache_errors, output_error
+from warpslam.errors import ConfigError, DatasetError
+from warpslam.evaluation import AteResult, ReconstructionResult, ate
+from warpslam.method import DEFAULT_METHOD, has_checkpoints
+from warpslam.output import kernel_cache_errors, log_file, output_error
 from warpslam.resume import (
     RunProgress,
     RunRequest,
     SavedRun,
+    find_checkpoint,
     frame_digest,
     remove_checkpoints,
     write_checkpoint,
 )
-from warpslam.run_folder import RunFolder, Source, read_json, write_json
+from warpslam.run_folder import RunFolder, Source
+from warpslam.run_results import RunResults, render_panel
+from warpslam.run_setup import (
+    GivenPoses,
+    build_baseline,
+    build_slam,
+    check_checkpoint_settings,
+    check_device,
+    device_name,
+    load_kernels,
+    load_slam,
+    open_map,
+    select_frames,
+)
 
 if TYPE_CHECKING:
     import trimesh
 
-    from warpslam.camera import Intrinsics
     from warpslam.compilation import ModuleProgress
     from warpslam.config import Config
-    from warpslam.method import Method
-    from warpslam.plots import Panel
     from warpslam.sequences.base import Frame, RgbdSequence
-    from warpslam.slam import FrameResult, Slam
-    from warpslam.trajectory import Trajectory
+    from warpslam.slam import FrameResult
+
+__all__ = [
+    "GivenPoses", "Progress", "RunResult", "build_baseline", "build_slam", "check_device", "load_kernels", "load_slam",
+    "open_map", "render_panel", "run", "select_frames",
+]  # fmt: skip
 
 log = logging.getLogger(__name__)
-
-PANEL_COUNT = 4
-PANEL_WIDTH = 240  # [px], at most
 
 
 @dataclass(frozen=True)
@@ -115,6 +107,7 @@ def run(
     map_path: str | Path | None = None,
     localize_only: bool = False,
     saved: SavedRun | None = None,
+    go_on: bool = False,
     check_input: bool = True,
 ) -> RunResult:
     """Run SLAM over a sequence and write a run folder.
@@ -133,11 +126,13 @@ def run(
         method: One of `warpslam.method.METHODS`.
         poses: Trajectory in the TUM format whose poses are given to the method in place of the sequence's own; frames
             without one are left out. Errors are against the sequence's own as ever.
-        checkpoint_every: Frames between two checkpoints; None for none. The schedule has to be deterministic for a
-            resumed run to give the same bytes.
+        checkpoint_every: Frames between two checkpoints; None for none. With the schedule strict a resumed run gives
+            the same bytes as one that was never stopped; with overlapped it gives a result as good as any other run's.
         map_path: Map to start from, a file that `Slam.save` wrote; the first frame is looked for in it.
         localize_only: The map is left as it is.
         saved: Checkpoint of the run in ``output``, which goes on from there; all else must be as it was.
+        go_on: Go on from the last checkpoint in ``output``, where there is one of this very run; where it is of no use,
+            a warning says why, and the run starts from the beginning.
         check_input: Refuse an input that `warpslam.checking` finds can't work; its warnings are logged in any case.
 
     Raises:
@@ -145,7 +140,7 @@ def run(
             so, where it can be.
     """
     selected = select_frames(sequence, frames)
-    _check_checkpoint_settings(checkpoint_every, map_path, localize_only, method)
+    check_checkpoint_settings(checkpoint_every, map_path, localize_only, method)
     request = RunRequest(
         sequence.name,
         len(sequence),
@@ -153,20 +148,24 @@ def run(
         (selected.start, selected.stop, selected.step),
         config.model_dump(),
         seed,
-        _device_name(device),
+        device_name(device),
         str(map_path) if map_path is not None else None,
         localize_only,
         dataclasses.asdict(source) if source is not None else None,
         str(poses) if poses is not None else None,
     )
+    why_anew = ""
+    if go_on and has_checkpoints(method) and saved is None and output is not None:
+        saved, why_anew = find_checkpoint(RunFolder(output), request, sequence)
+    elif saved is not None:
+        saved.check(request, sequence)
     if saved is None:
         folder = RunFolder.create(output, sequence.name)
     else:
         assert output is not None
-        saved.check(request, sequence)
         folder = RunFolder(output)
         folder.clear_results()
-    with _log_file(folder.log, append=saved is not None):
+    with log_file(folder.log, append=saved is not None):
         given = None if poses is None else GivenPoses.read(poses)
         run_ = _Run(
             sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame, on_module, method, given
@@ -174,10 +173,15 @@ def run(
         run_.request, run_.checkpoint_every, run_.check_input = request, checkpoint_every, check_input
         if saved is not None:
             run_.go_on_from(saved)
+        elif why_anew:
+            run_.metrics["started_anew"] = why_anew
+            log.warning("starting from the beginning: %s", why_anew)
         return run_.execute()
 
 
-class _Run:
+class _Run(RunResults):
+    """A run under way: the loop over the frames, and its checkpoints."""
+
     def __init__(
         self,
         sequence: RgbdSequence,
@@ -193,31 +197,16 @@ class _Run:
         method: str,
         given: GivenPoses | None,
     ) -> None:
-        self.method, self.given = method, given
-        self.sequence, self.config, self.folder, self.selected = sequence, config, folder, selected
-        self.device, self.seed, self.source, self.truth_mesh, self.on_frame = device, seed, source, truth_mesh, on_frame
-        self.on_module = on_module
-        self.modules: list[ModuleProgress] = []
-        self.slam: Method | None = None
-        self.status = "finished"
-        self.started = datetime.now().astimezone()
-        self.frame_indices: list[int] = []
-        self.truth_poses: list[np.ndarray] = []
-        self.results: list[FrameResult] = []
-        self.left_out: list[dict[str, Any]] = []
+        super().__init__(sequence, config, folder, selected, device, seed, source, truth_mesh, method, given)
+        self.on_frame, self.on_module = on_frame, on_module
         self.check_input = True
-        self.seconds: dict[str, float] = defaultdict(float)
         self.request: RunRequest | None = None
         self.checkpoint_every: int | None = None
         self.saved: SavedRun | None = None
         self.position = 0  # in the selection
-        self.first_index = 0  # frames of the map that the run started from
         self.resumed_count = 0  # results that came from a checkpoint
         self.digests: dict[int, str] = {}
         self.start = self.frames_start = 0.0
-        self.ate: AteResult | None = None
-        self.reconstruction: ReconstructionResult | None = None
-        self.metrics: dict[str, Any] = {}
 
     def go_on_from(self, saved: SavedRun) -> None:
         """Take up a run at its checkpoint."""
@@ -228,6 +217,7 @@ class _Run:
         self.seconds.update(progress.seconds)
         self.digests = progress.digests
         self.resumed_count = len(progress.results)
+        self.metrics["resumed_after"] = progress.position
 
     def execute(self) -> RunResult:
         self.start = time.perf_counter()
@@ -242,14 +232,7 @@ class _Run:
                 self.status = "interrupted"
                 log.warning("interrupted: writing what there is; press ctrl-C again to leave it")
             if self.results:
-                self._write_trajectory()
-                self._write_frames()
-                self._evaluate_trajectory()
-                self._write_map()
-                self._describe_map()
-                self._write_mesh()
-                self._evaluate_reconstruction()
-                self._draw_plots()
+                self._write_results()
             if self.status == "finished":
                 remove_checkpoints(self.folder)
         except KeyboardInterrupt:
@@ -264,12 +247,6 @@ class _Run:
             self.seconds["total"] += time.perf_counter() - self.start
             self._write_figures()
         return RunResult(self.folder, self.status, self.metrics, self.ate, self.reconstruction)
-
-    def _write_input(self) -> None:
-        self.config.save(self.folder.config)
-        if self.source is not None:
-            self.folder.write_source(self.source)
-        log.info("%s: %d of %d frames, %s", self.sequence.name, len(self.selected), len(self.sequence), self.selected)
 
     def _check_input(self) -> None:
         tracking = self.config.tracking
@@ -295,43 +272,6 @@ class _Run:
             return self.sequence[self.selected[0]].T_world_camera
         except DatasetError:
             return None
-
-    def _fail(self, error: Exception) -> None:
-        """Note the failure, and save the trajectory if that has not happened yet."""
-        self.status = "failed"
-        self.metrics["error"] = f"{type(error).__name__}: {error}"
-        log.exception("the run failed")
-        for leftover in self.folder.path.glob("*.part*"):
-            # Half a map may be what filled the disk.
-            leftover.unlink(missing_ok=True)
-        if self.results and not self.folder.trajectory.exists():
-            try:
-                self._write_trajectory()
-            except OSError:
-                rescued = Path(tempfile.mkdtemp(prefix=f"warpslam_{self.folder.path.name}_")) / "trajectory.tum"
-                trajectory, count = self._trajectory()
-                write_tum(rescued, trajectory.timestamps[:count], trajectory.poses[:count])
-                log.error("%s can't be written: the trajectory so far is in %s", self.folder.trajectory, rescued)
-
-    def _unusable_frames(self) -> list[dict[str, Any]]:
-        """Frames that were left out or skipped, and why, in their order."""
-        frames = [{"frame": f["index"], "status": "unreadable", "reason": f["message"]} for f in self.left_out]
-        for index, result in zip(self.frame_indices, self.results, strict=False):
-            if result.status == "SKIPPED":
-                frames.append({"frame": index, "status": "SKIPPED", "reason": result.message})
-        return sorted(frames, key=lambda frame: frame["frame"])
-
-    def _write_figures(self) -> None:
-        try:
-            self._write_metrics()
-            self._write_timing()
-            self._write_frame_records()
-            self._write_report()
-        except OSError as error:
-            if self.status != "failed":
-                self.status = "failed"
-                raise output_error(error, self.folder.path) from error
-            log.error("%s", output_error(error, self.folder.path))
 
     def _build_slam(self) -> None:
         request = self.request
@@ -457,412 +397,7 @@ class _Run:
         for phase, seconds in phases.items():
             self.seconds[f"finish_{phase}"] += seconds
 
-    def _trajectory(self) -> tuple[Trajectory, int]:
-        """The trajectory, and how many of its poses belong to frames that were finished."""
-        assert self.slam is not None
-        trajectory, first = self.slam.trajectory, self.first_index
-        if first:
-            parts = (trajectory.timestamps[first:], trajectory.poses[first:], trajectory.status[first:])
-            trajectory = dataclasses.replace(trajectory, timestamps=parts[0], poses=parts[1], status=parts[2])
-        # After an interrupt the trajectory may hold the pose of a frame that never came back.
-        return trajectory, len(self.results)
-
-    def _write_trajectory(self) -> None:
-        trajectory, count = self._trajectory()
-        partial = self.folder.trajectory.with_name("trajectory.tum.partial")
-        write_tum(partial, trajectory.timestamps[:count], trajectory.poses[:count])
-        partial.replace(self.folder.trajectory)
-        if self._has_truth():
-            write_tum(self.folder.ground_truth, trajectory.timestamps[:count], np.array(self.truth_poses)[:count])
-
-    def _write_frames(self) -> None:
-        """A line a frame: what the TUM format has no place for."""
-        with open(self.folder.frames, "w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(["frame", "timestamp", "status", "inliers", "depth_error_m", "message"])
-            for index, result in zip(self.frame_indices, self.results, strict=False):
-                figures = (f"{result.inliers:.4f}", f"{result.depth_error:.5f}")
-                writer.writerow([index, f"{result.timestamp:.6f}", result.status, *figures, result.message])
-
-    def _has_truth(self) -> bool:
-        return any(np.isfinite(T).all() for T in self.truth_poses)
-
-    def _evaluate_trajectory(self) -> None:
-        trajectory, count = self._trajectory()
-        truth = np.array(self.truth_poses)[:count]
-        try:
-            self.ate = ate(trajectory.poses[:count], truth)
-        except InputError as error:
-            log.info("no trajectory error: %s", error)
-            return
-        self.metrics.update(trajectory_metrics(trajectory.poses[:count], truth))
-
-    def _write_map(self) -> None:
-        assert self.slam is not None
-        with self._clock("saving"):
-            self.slam.save(self.folder.map)
-        self.metrics["map"] = {"bytes": self.slam.map_bytes, "flops_per_point": self.slam.flops_per_point}
-
-    def _describe_map(self) -> None:
-        from warpslam.inventory import take_inventory
-        from warpslam.slam import Slam
-
-        if isinstance(self.slam, Slam):
-            with self._clock("inventory"):
-                self.metrics.update(take_inventory(self.slam))
-                self.metrics["memory"] = self.slam.memory()
-
-    def _write_mesh(self) -> None:
-        assert self.slam is not None
-        from warpslam.meshing import write_mesh
-
-        try:
-            with self._clock("meshing"):
-                mesh = self.slam.mesh()
-                write_mesh(mesh, self.folder.mesh)
-        except MeshError as error:
-            log.error("no mesh: %s", error)
-            self.metrics["mesh"] = {"error": str(error)}
-            return
-        self.metrics["mesh"] = {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "area_m2": float(mesh.area)}
-
-    def _evaluate_reconstruction(self) -> None:
-        if self.truth_mesh is None or not self.folder.mesh.is_file():
-            return
-        trajectory, count = self._trajectory()
-        truth = np.array(self.truth_poses)[:count]
-        known = np.isfinite(truth).all(axis=(1, 2))
-        poses = np.where(known[:, None, None], truth, trajectory.poses[:count])
-        used = [p for p, result in enumerate(self.results[:count]) if result.status != "SKIPPED"]
-        indices = [self.frame_indices[p] for p in used]
-        try:
-            with self._clock("evaluation"):
-                results = evaluate_mesh(
-                    self.folder.mesh, self.truth_mesh, self.sequence, indices, poses[used], device=self.device
-                )
-        except (MeshError, DatasetError) as error:
-            log.error("no reconstruction metrics: %s", error)
-            self.metrics["reconstruction"] = {"error": str(error)}
-            return
-        self.reconstruction = results[DEFAULT_PROTOCOL]
-        self.metrics["reconstruction"] = reconstruction_metrics(self.reconstruction)
-
-    def _draw_plots(self) -> None:
-        from warpslam.plots import plot_error, plot_panels, plot_top_view, save_panels
-
-        trajectory, count = self._trajectory()
-        poses, status = trajectory.poses[:count], trajectory.status[:count]
-        with self._clock("plotting"):
-            if self.ate is not None:
-                aligned = np.einsum("ij,njk->nik", self.ate.T_truth_estimate, poses)
-                plot_top_view(self.folder.top_view, aligned, np.array(self.truth_poses)[:count], status)
-            else:
-                plot_top_view(self.folder.top_view, poses, None, status)
-            plot_error(self.folder.error_plot, trajectory.timestamps[:count], self.ate, self._losses(count), status)
-        panels = self._render_panels(poses)
-        if not panels:
-            return
-        with self._clock("plotting"):
-            plot_panels(self.folder.panels, panels)
-            save_panels(self.folder.panel_images, panels)
-        self.metrics["rendering"] = rendering_metrics(panels)
-
-    def _losses(self, count: int) -> dict[str, np.ndarray]:
-        names = sorted({name for result in self.results for name in result.losses})
-        losses = {name: np.full(count, np.nan) for name in names}
-        for position, result in enumerate(self.results[:count]):
-            for name, value in result.losses.items():
-                losses[name][position] = value
-        return losses
-
-    def _render_panels(self, poses: np.ndarray) -> list[Panel]:
-        assert self.slam is not None
-        usable = [p for p, result in enumerate(self.results[: len(poses)]) if result.status != "SKIPPED"]
-        positions = [usable[i] for i in np.unique(np.linspace(0, len(usable) - 1, PANEL_COUNT).round().astype(int))]
-        # Small images tell as much in the figure, and rendering is slow without a GPU.
-        stride = -(-self.sequence.intrinsics.width // PANEL_WIDTH)
-        try:
-            frames = [self.sequence[self.frame_indices[p]] for p in positions]
-        except DatasetError as error:
-            log.error("no panels: %s", error)
-            return []
-        with self._clock("rendering"):
-            pairs = zip(frames, positions, strict=True)
-            return [render_panel(self.slam, frame, poses[p], stride) for frame, p in pairs]
-
-    def _write_timing(self) -> None:
-        phases: dict[str, list[float]] = defaultdict(list)
-        for result in self.results:
-            for phase, seconds in result.timings.items():
-                phases[phase].append(seconds)
-        write_json(
-            self.folder.timing,
-            {
-                "phases": {
-                    phase: {"seconds": sum(times), "calls": len(times), "mean_seconds": sum(times) / len(times)}
-                    for phase, times in phases.items()
-                },
-                "stages_seconds": dict(self.seconds),
-                "kernel_modules": {
-                    module.name: {"seconds": module.seconds, "compiled": module.compiled} for module in self.modules
-                },
-                "frames": [
-                    {"index": index, **result.timings}
-                    for index, result in zip(self.frame_indices, self.results, strict=False)
-                ],
-            },
-        )
-
-    def _write_frame_records(self) -> None:
-        frames = [
-            {
-                "index": index,
-                "timestamp": result.timestamp,
-                "status": result.status,
-                "message": result.message,
-                "inliers": result.inliers,
-                "losses": result.losses,
-            }
-            for index, result in zip(self.frame_indices, self.results, strict=False)
-        ]
-        write_json(self.folder.frame_records, {"frames": frames, "left_out": self.left_out})
-
-    def _write_report(self) -> None:
-        from warpslam.report import write_report
-
-        try:
-            write_report(self.folder)
-        except WarpSlamError as error:
-            # The run is done and its figures are written; what stands in the way is in the log and on the terminal.
-            log.error("no report: %s", error)
-        except Exception:
-            # Must not take the place of the error that ended the run.
-            if self.status != "failed":
-                raise
-            log.exception("no report")
-
-    def _write_metrics(self) -> None:
-        from warpslam import __version__
-        from warpslam.versions import package_versions
-
-        statuses = Counter(result.status for result in self.results)
-        frame_seconds = self.seconds["frames"]
-        self.metrics = {
-            "warpslam": __version__,
-            "sequence": self.sequence.name,
-            "method": self.method,
-            "poses": None if self.given is None else self.given.path,
-            "status": self.status,
-            "device": str(self.slam.device) if self.slam is not None else self.device,
-            "seed": self.seed,
-            "frames": {
-                "selected": len(self.selected),
-                "processed": len(self.results),
-                "unreadable": len(self.left_out),
-                **{status: statuses.get(status, 0) for status in ("OK", "LOST", "SKIPPED")},
-            },
-            "unusable_frames": self._unusable_frames(),
-            "seconds": {
-                "total": self.seconds["total"],
-                "kernel_compile": self.seconds["kernel_compile"],
-                "run": self.seconds["total"] - self.seconds["kernel_compile"],
-                "frames": frame_seconds,
-            },
-            "compiled_kernels": sorted(module.name for module in self.modules if module.compiled),
-            "fps": len(self.results) / frame_seconds if frame_seconds > 0 else None,
-            "peak_memory_mib": _peak_memory_mib(),
-            "started": self.started.isoformat(timespec="seconds"),
-            "versions": {"warpslam": __version__, "python": platform.python_version(), **package_versions()},
-            "platform": platform.platform(),
-            "processors": os.cpu_count(),
-            **self.metrics,
-        }
-        write_json(self.folder.metrics, self.metrics)
-
-    @contextmanager
-    def _clock(self, stage: str) -> Iterator[None]:
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[stage] += time.perf_counter() - start
-
-
-def load_kernels(
-    sequence: RgbdSequence, device: str | None, report: Callable[[ModuleProgress], None] | None = None
-) -> list[ModuleProgress]:
-    """Load all kernels that a run over ``sequence`` needs, compiling those that never were; see
-    `warpslam.compilation.compile_kernels`.
-
-    Raises:
-        ConfigError: There is no such device.
-    """
-    import warp as wp
-
-    from warpslam.compilation import compile_kernels
-
-    check_device(device)
-    return compile_kernels(wp.get_device(device), report, getattr(sequence, "warp_modules", ()))
-
-
-@dataclass(frozen=True)
-class GivenPoses:
-    """Poses that a file gives to frames, by time.
-
-    path: File. times: [s], shape (N,). poses: T_world_camera, shape (N, 4, 4).
-    """
-
-    path: Path
-    times: np.ndarray
-    poses: np.ndarray
-
-    @classmethod
-    def read(cls, path: str | Path) -> GivenPoses:
-        """Read a trajectory in the TUM format, such as an earlier run's trajectory.tum.
-
-        Raises:
-            DatasetError: The file can't be read.
-        """
-        return cls(Path(path), *read_tum(path))
-
-    def at(self, timestamp: float) -> np.ndarray | None:
-        """The pose nearest in time, within 20 ms; None if there is none."""
-        position = int(associate(np.array([timestamp]), self.times)[0])
-        return None if position < 0 else self.poses[position]
-
-
-def build_slam(intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Method:
-    """The SLAM object of a run.
-
-    Raises:
-        ConfigError: There is no such device.
-        CheckpointError: The decoders can't be loaded.
-    """
-    return build_baseline(DEFAULT_METHOD, intrinsics, config, device, seed)
-
-
-def build_baseline(method: str, intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Method:
-    """Any method of a run, by name; see `warpslam.method.build_method` for what it raises."""
-    check_device(device)
-    return build_method(method, intrinsics, config, device, seed)
-
-
-def open_map(
-    path: str | Path, intrinsics: Intrinsics, config: Config, device: str | None, *, localize_only: bool = False
-) -> Slam:
-    """The SLAM object of a run that starts from a map.
-
-    Raises:
-        ConfigError: There is no such device, or the settings do not fit the map.
-        CheckpointError: The map can't be loaded.
-        InputError: The map was made with another camera.
-    """
-    from warpslam.slam import Slam
-
-    check_device(device)
-    slam = Slam.load(path, device, config=config, localize_only=localize_only)
-    if slam.intrinsics != intrinsics:
-        raise InputError(f"{path} was made with another camera: {slam.intrinsics}, the sequence has {intrinsics}")
-    slam.forget_pose()
-    return slam
-
-
-def load_slam(folder: RunFolder, device: str | None = None) -> Method:
-    """The SLAM object (or the baseline) as a run left it.
-
-    Raises:
-        ConfigError: There is no such device.
-        DatasetError: The run saved no map.
-        CheckpointError: The map can't be loaded.
-    """
-    path = folder.require(folder.map, "the run stopped before it had a map")
-    check_device(device)
-    return load_method(read_json(folder.metrics).get("method", DEFAULT_METHOD), path, device)
-
-
-def check_device(device: str | None) -> None:
-    """Whether Warp has the device of that name; None is Warp's preferred one.
-
-    Raises:
-        ConfigError: It has not.
-    """
-    import warp as wp
-
-    names = [str(known) for known in wp.get_devices()]
-    if device is not None and device not in (*names, "cuda"):
-        raise ConfigError(f"device {device!r} is not there; this machine has {', '.join(names)}")
-
-
-def _device_name(device: str | None) -> str:
-    """The device that a name, or none, leads to; a name that leads nowhere is told of when the run starts."""
-    import warp as wp
-
-    names = [str(known) for known in wp.get_devices()]
-    return str(wp.get_device(device)) if device is None or device in (*names, "cuda") and names[1:] else str(device)
-
-
-def _check_checkpoint_settings(
-    every: int | None, map_path: str | Path | None, localize_only: bool, method: str
-) -> None:
-    if method != DEFAULT_METHOD and (every is not None or map_path is not None):
-        raise ConfigError(f"method {method} has no checkpoints and takes no map: leave out checkpoint_every and map")
-    if every is not None and every < 1:
-        raise ConfigError(f"checkpoint_every = {every} must be at least 1 frame")
-    if localize_only and map_path is None:
-        raise ConfigError("localize_only needs a map: name one with map_path (--map)")
-
-
-def render_panel(slam: Method, frame: Frame, T_world_camera: np.ndarray, stride: int = 1) -> Panel:
-    """A frame beside what the map renders from ``T_world_camera`` (4, 4), every ``stride``-th pixel of both."""
-    from warpslam.plots import Panel
-
-    image = slam.render(T_world_camera, stride=stride)
-    rgb, depth = frame.rgb[::stride, ::stride], frame.depth[::stride, ::stride]
-    return Panel(frame.index, rgb, depth, np.asarray(image.rgb), np.asarray(image.depth))
-
-
-def select_frames(sequence: RgbdSequence, frames: slice | None) -> range:
-    """Numbers of the frames to use, all by default.
-
-    Raises:
-        ConfigError: The slice selects none, or goes backwards.
-    """
-    frames = slice(None) if frames is None else frames
-    if frames.step is not None and frames.step < 1:
-        raise ConfigError(f"frames: step {frames.step} must be at least 1; SLAM goes forward in time")
-    selected = range(*frames.indices(len(sequence)))
-    if len(selected) == 0:
-        wanted = ":".join("" if part is None else str(part) for part in (frames.start, frames.stop, frames.step))
-        raise ConfigError(f"frames {wanted} selects none of the {len(sequence)} frames of {sequence.name}")
-    return selected
-
 
 def _describe(result: FrameResult) -> str:
     losses = " ".join(f"{name}={value:.4g}" for name, value in result.losses.items())
     return f"{result.status} {losses} inliers={result.inliers:.2f} {result.message}".rstrip()
-
-
-def _peak_memory_mib() -> float | None:
-    try:
-        import resource
-    except ImportError:  # not on Windows
-        return None
-    unit = 2**20 if sys.platform == "darwin" else 2**10
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
-
-
-@contextmanager
-def _log_file(path: Path, *, append: bool = False) -> Iterator[None]:
-    """Send everything that warpslam logs, from INFO up, to a file as well."""
-    logger = logging.getLogger("warpslam")
-    handler = LogFile(path, logger, append=append)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    level = logger.level
-    logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
-    try:
-        yield
-    finally:
-        logger.setLevel(level)
-        logger.removeHandler(handler)
-        handler.close()

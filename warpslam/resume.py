@@ -116,6 +116,11 @@ class SavedRun:
 
         slam = slam_from_state(self.path, *self.state, device=self.request.device, config=config)
         slam.config.mapping.enabled &= not self.request.localize_only
+        if slam.config.schedule == "overlapped":
+            log.warning(
+                "the schedule overlapped does not repeat to the bit: the run goes on from a whole map, but its result "
+                "will differ from that of a run that was not stopped; with schedule=strict it would be the same"
+            )
         slices = self.state[0].get("slices")
         if slices != slice_count(slam.device):
             log.warning(
@@ -203,6 +208,24 @@ def read_checkpoint(folder: RunFolder) -> SavedRun:
             log.warning("%s; going on from the checkpoint before", problem)
         return saved
     raise CheckpointError("; ".join(problems))
+
+
+def find_checkpoint(folder: RunFolder, request: RunRequest, sequence: RgbdSequence) -> tuple[SavedRun | None, str]:
+    """The checkpoint that an unfinished run in ``folder`` can go on from, where there is one, and why it can't if
+    there is one of no use: damaged, or of a run that was asked for something else.
+
+    A run that was on one GPU goes on on another.
+    """
+    if not (folder.checkpoint.exists() or folder.previous_checkpoint.exists()):
+        return None, ""
+    try:
+        saved = read_checkpoint(folder)
+        if saved.request.device.startswith("cuda") and request.device.startswith("cuda"):
+            saved = dataclasses.replace(saved, request=dataclasses.replace(saved.request, device=request.device))
+        saved.check(request, sequence)
+    except (CheckpointError, ConfigError) as error:
+        return None, str(error)
+    return saved, ""
 
 
 def remove_checkpoints(folder: RunFolder) -> None:

@@ -19,8 +19,9 @@ from warpslam.evaluation import (
     rendering_metrics,
     trajectory_metrics,
 )
-from warpslam.pipeline import load_slam, render_panel
 from warpslam.run_folder import RunFolder, Source, read_json
+from warpslam.run_results import render_panel
+from warpslam.run_setup import load_slam
 
 if TYPE_CHECKING:
     import trimesh

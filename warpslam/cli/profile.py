@@ -38,7 +38,7 @@ def _profile(options: argparse.Namespace) -> int:
     from rich.console import Console
 
     from warpslam.errors import ConfigError
-    from warpslam.pipeline import select_frames
+    from warpslam.run_setup import select_frames
 
     quiet_warp()
     for option, file in (("--json", options.json), ("--trace", options.trace)):
@@ -83,8 +83,8 @@ def _input(options: argparse.Namespace) -> tuple[RgbdSequence, Config]:
 def _run(sequence: RgbdSequence, config: Config, selected: range, options: argparse.Namespace) -> Profile:
     from warpslam import profile
     from warpslam.errors import MeshError
-    from warpslam.pipeline import build_slam, load_kernels
     from warpslam.profiling import phase
+    from warpslam.run_setup import build_slam, load_kernels
 
     with profile() as result:
         with phase("setup"):

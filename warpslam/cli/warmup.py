@@ -36,7 +36,7 @@ def _warmup(options: argparse.Namespace) -> int:
     import warp as wp
 
     from warpslam.compilation import compile_for_architecture, compile_kernels
-    from warpslam.pipeline import check_device
+    from warpslam.run_setup import check_device
     from warpslam.synthetic.sequence import RenderedSequence
 
     quiet_warp()

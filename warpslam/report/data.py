@@ -23,7 +23,8 @@ class FrameRecord:
     """What became of a frame.
 
     index: Number in the sequence. timestamp: [s]. status: "OK", "LOST", "SKIPPED". message: Why it is not OK.
-    inliers: Share of depth rays that agree with the map. losses: Mean loss per ray by name.
+    inliers: Share of depth rays that agree with the map. losses: Mean loss per ray by name. depth_error: Mean error of
+    those rays [m].
     """
 
     index: int
@@ -32,6 +33,7 @@ class FrameRecord:
     message: str
     inliers: float | None
     losses: dict[str, float | None]
+    depth_error: float | None = None
 
 
 @dataclass(frozen=True)
