@@ -8,7 +8,7 @@ import pytest
 import torch
 import warp as wp
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import Intrinsics, pose_from_vector
 from warpslam.config import Config
 from warpslam.decoders import load_decoders
 from warpslam.errors import CheckpointError, ConfigError, InputError
@@ -121,9 +121,14 @@ def test_keyframes_by_interval_and_by_information_gain(frames):
 
 
 def test_given_poses_are_taken(frames):
-    """With use_given_poses the trajectory is the truth, and a frame without a pose is refused."""
-    slam = run(frames[:3], "tracking.use_given_poses=true", "mapping.bundle_adjustment=false")
-    np.testing.assert_allclose(slam.trajectory.poses, [f.T_world_camera for f in frames[:3]], atol=1e-6)
+    """With use_given_poses trajectory and keyframes have the truth, whatever bundle adjustment would say, and a frame
+    without a pose is refused.
+    """
+    adjusted = ("mapping.every=1", "keyframes.every=1", "mapping.bundle_adjustment_keyframes=2")
+    slam = run(frames[:3], "tracking.use_given_poses=true", *adjusted)
+    truth = [f.T_world_camera for f in frames[:3]]
+    np.testing.assert_allclose(slam.trajectory.poses, truth, atol=1e-6)
+    np.testing.assert_allclose([pose_from_vector(k.pose) for k in slam.keyframes], truth, atol=1e-6)
     with pytest.raises(InputError, match="frame 3"):
         slam.step(frames[3].rgb, frames[3].depth)
 

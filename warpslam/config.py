@@ -89,7 +89,7 @@ class TrackingConfig(_Group):
         "fixed_pixels",
         description="final pose: the last one, or the best of start, last and mean on one fixed set of pixels",
     )
-    use_given_poses: bool = Field(False, description="take T_world_camera as given instead of tracking")
+    use_given_poses: bool = Field(False, description="take T_world_camera as given: no tracking, no bundle adjustment")
     lost_depth_error: float = Field(
         0.15, gt=0, description="mean depth residual of the inliers beyond which tracking is lost [m]"
     )

@@ -101,7 +101,11 @@ class Slam:
         self._images = ImagePool(intrinsics, self.device, self.config.keyframes.max_gigabytes)
         self._tracker = Tracker(intrinsics, self.config.tracking, self.config.sampling, self.device, seed)
         self._localizer = Localizer(self._tracker, self.config.tracking, intrinsics)
-        self._mapper = Mapper(self.scene, intrinsics, self.config.mapping, self.config.sampling, self.device, seed)
+        mapping = self.config.mapping
+        if self.config.tracking.use_given_poses:
+            # What is given stays as it is.
+            mapping = mapping.model_copy(update={"bundle_adjustment": False})
+        self._mapper = Mapper(self.scene, intrinsics, mapping, self.config.sampling, self.device, seed)
         self._scheduler = new_scheduler(self.config.schedule, self._mapper, self._images)
         self._vectors: list[np.ndarray] = []
         self._timestamps: list[float] = []
