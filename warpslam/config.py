@@ -136,6 +136,9 @@ class MappingConfig(_Group):
     color_weight: float = Field(0.2, ge=0, description="lambda_p of Eq. 10")
     loss: Literal["sum", "mean"] = Field("sum", description="sums over rays (released code) or means (Eq. 8-9)")
     train_color_decoder: bool = Field(True, description="the colour decoder is optimised with the map")
+    depth_start: bool = Field(
+        True, description="middle features that are seen for the first time start from the measured depth, not as noise"
+    )
     frustum_selection: bool = Field(True, description="only vertices in the current frustum change (A.1)")
     frustum_margin: float = Field(0.5, ge=0, description="selected vertices reach this far behind the surface [m]")
     coarse: bool = Field(True, description="optimise the coarse level, which forecasts unseen geometry")
@@ -332,7 +335,7 @@ _PAPER: dict[str, Any] = {"optimizer": "adam", "final_rate_factor": 1.0}
 
 
 def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, Any]:
-    mapping = {"first_iterations": 1500, **groups.pop("mapping", {})}
+    mapping = {"first_iterations": 1500, "depth_start": False, **groups.pop("mapping", {})}
     return {"sampling": {"jitter": False}, "tracking": {**_PAPER, **(tracking or {})}, "mapping": mapping, **groups}
 
 

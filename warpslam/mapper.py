@@ -14,6 +14,7 @@ import warp as wp
 
 from warpslam.camera import Intrinsics, pose_from_vector, vector_from_pose
 from warpslam.config import MappingConfig, SamplingConfig
+from warpslam.depth_start import DepthStart
 from warpslam.field import STAGES, Gradients, RayBatch, Thresholds
 from warpslam.frustum import select_in_frustum
 from warpslam.keyframes import ImagePool, Keyframe, overlap_fractions
@@ -76,6 +77,9 @@ class Mapper:
         self._batch = RayBatch(config.pixels, samples, device, self._launcher)
         self._losses = wp.zeros(len(STAGES), dtype=float, device=device)
         self._changed: set[str] = set()
+        self._depth_start: DepthStart | None = None
+        if config.depth_start:
+            self._depth_start = DepthStart(scene.decoder_weights.middle, scene.grids["middle"].spacing)
 
     def map_first(
         self, images: ImagePool, frame: int, vector: np.ndarray, on_iteration: Callable | None = None
@@ -240,6 +244,8 @@ class Mapper:
                     grid.lattice, grid.shape, self.camera, T_world_camera, depth, self.config.frustum_margin
                 )
             optimizer.begin(grid, mask)
+            if level == "middle" and self._depth_start is not None and not everything:
+                self._depth_start.apply(grid, self.camera, T_world_camera, depth, optimizer.selected)
         self._decoder.begin()
 
     def _iterate(

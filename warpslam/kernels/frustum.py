@@ -1,5 +1,7 @@
 """Frustum feature selection (A.1, Sec. 3.3): which vertices of a grid the current frame may change.
 
+`start_from_depth` is ours: see `warpslam.depth_start`.
+
 A vertex is selected if it projects inside the image and lies in front of the camera, no deeper than 0.5 m behind the
 measured surface
 (bilinear depth at its pixel; the largest looked-up depth where there is none), or if it is within 0.5 m of the camera
@@ -8,7 +10,11 @@ centre.
 
 import warp as wp
 
-from warpslam.kernels.grid import Lattice, row_of
+from warpslam.kernels.grid import Lattice, Vec32, row_of
+
+# What `start_from_depth` knows of a vertex.
+SEEN = wp.constant(wp.uint8(1))
+GUESSED = wp.constant(wp.uint8(2))
 
 
 @wp.func
@@ -79,3 +85,43 @@ def select_vertices(
     depth = vertex_depth[row]
     chosen = (depth >= 0.0 and depth <= measured + margin) or wp.length(p - camera_center) < margin
     selected[row] = wp.where(chosen, wp.uint8(1), wp.uint8(0))
+
+
+@wp.kernel(enable_backward=False)
+def start_from_depth(
+    lattice: Lattice,
+    T_camera_world: wp.mat44,
+    focal: wp.vec2,
+    center: wp.vec2,
+    image: wp.array2d(dtype=float),
+    selected: wp.array(dtype=wp.uint8),
+    base: Vec32,
+    slope: Vec32,
+    truncation: float,
+    reach: float,
+    started: wp.array(dtype=wp.uint8),
+    features: wp.array(dtype=Vec32),
+):
+    """Vertices seen for the first time, or seen to be free after they were thought to lie behind a surface."""
+    i, j, k = wp.tid()
+    row = row_of(lattice, i, j, k)
+    if selected[row] == wp.uint8(0) or started[row] == SEEN:
+        return
+    spacing = wp.cw_div(wp.vec3(1.0, 1.0, 1.0), lattice.inverse_spacing)
+    p = lattice.origin + wp.cw_mul(wp.vec3(float(i), float(j), float(k)), spacing)
+    q = wp.transform_point(T_camera_world, p)
+    if q[2] <= 0.0:
+        return
+    u = int(wp.rint(focal[0] * q[0] / q[2] + center[0]))
+    v = int(wp.rint(focal[1] * q[1] / q[2] + center[1]))
+    if u < 0 or u >= image.shape[1] or v < 0 or v >= image.shape[0]:
+        return
+    # The nearest pixel: a mean over an outline is the depth of nothing.
+    measured = image[v, u]
+    if measured <= 0.0:
+        return
+    distance = q[2] - measured
+    if distance > reach or (started[row] == GUESSED and distance > 0.0):
+        return
+    started[row] = wp.where(distance > 0.0, GUESSED, SEEN)
+    features[row] = base + wp.clamp(distance, -truncation, truncation) * slope

@@ -169,8 +169,10 @@ def fill_grid(
     std: float,
     old_lattice: Lattice,
     old_features: wp.array(dtype=Vec32),
+    old_started: wp.array(dtype=wp.uint8),
     shift: wp.vec3i,
     features: wp.array(dtype=Vec32),
+    started: wp.array(dtype=wp.uint8),
 ):
     """Fill a grid of any extent: rows of the old grid are kept, the others start random (``first``: world index of
     vertex 0).
@@ -182,9 +184,12 @@ def fill_grid(
     c = k - shift[2]
     s = old_lattice.shape
     if a >= 0 and b >= 0 and c >= 0 and a < s[0] and b < s[1] and c < s[2]:
-        features[row] = old_features[row_of(old_lattice, a, b, c)]
+        old_row = row_of(old_lattice, a, b, c)
+        features[row] = old_features[old_row]
+        started[row] = old_started[old_row]
     else:
         features[row] = init_normal(seed, level, first[0] + i, first[1] + j, first[2] + k, std)
+        started[row] = wp.uint8(0)
 
 
 @wp.kernel(enable_backward=False)
