@@ -136,6 +136,8 @@ class MappingConfig(_Group):
     color_weight: float = Field(0.2, ge=0, description="lambda_p of Eq. 10")
     loss: Literal["sum", "mean"] = Field("sum", description="sums over rays (released code) or means (Eq. 8-9)")
     train_color_decoder: bool = Field(True, description="the colour decoder is optimised with the map")
+    optimize_middle: bool = Field(True, description="off: middle features stay as they began, for ablations (Fig. 9)")
+    optimize_fine: bool = Field(True, description="off: fine features stay as they began, for ablations (Fig. 9)")
     frustum_selection: bool = Field(True, description="only vertices in the current frustum change (A.1)")
     frustum_margin: float = Field(0.5, ge=0, description="selected vertices reach this far behind the surface [m]")
     coarse: bool = Field(True, description="optimise the coarse level, which forecasts unseen geometry")
