@@ -169,6 +169,25 @@ def test_manifest(tmp_path):
     assert Job.from_dict(second.to_dict()) == second
 
 
+def test_manifest_names_methods_poses_and_checkpoints(tmp_path):
+    """Method, given poses (relative to the file) and checkpoints, of all sequences or of one; 0 is for none."""
+    text = """
+    defaults: {method: tsdf, poses: poses.tum, checkpoint_every: 7}
+    sequences: [a, {path: b, method: nice-slam, checkpoint_every: 0}]
+    """
+    (tmp_path / "m.yaml").write_text(text)
+    first, second = read_manifest(tmp_path / "m.yaml", replace(COMMON, checkpoint_every=50))
+    assert (first.method, first.poses, first.checkpoint_every) == ("tsdf", str(tmp_path / "poses.tum"), 7)
+    assert (second.method, second.checkpoint_every) == ("nice-slam", None)
+
+
+def test_checkpoints_do_not_decide_on_the_result():
+    """A batch with other checkpoints is still the same batch; one with another method or other poses is not."""
+    job = Job("a", "/a")
+    assert replace(job, checkpoint_every=5).settings_hash == job.settings_hash
+    assert len({j.settings_hash for j in (job, replace(job, method="tsdf"), replace(job, poses="/p"))}) == 3
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -215,6 +234,8 @@ def test_settings_are_refused_before_any_worker_starts(tmp_path):
     bad = [
         ([replace(jobs("a")[0], overrides=("mapping.window=0",))], {}, "mapping.window"),
         ([replace(jobs("a")[0], preset="fast")], {}, "preset 'fast'"),
+        ([jobs("b")[0], replace(jobs("a")[0], method="orb")], {}, "method 'orb' is unknown"),
+        ([replace(jobs("a")[0], checkpoint_every=-1)], {}, "checkpoint_every = -1 of a"),
         ([], {}, "the batch is empty"),
         (jobs("a"), {"workers": 0}, "workers = 0"),
         (jobs("a"), {"memory_gb": 0.0}, "memory_gb"),

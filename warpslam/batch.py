@@ -22,6 +22,7 @@ from typing import Any
 
 from warpslam import __version__
 from warpslam.errors import ConfigError, DatasetError
+from warpslam.method import DEFAULT_METHOD, check_method
 from warpslam.run_folder import RunFolder, as_file_name, read_json, write_json
 
 STATE_FILE = "batch.json"
@@ -37,7 +38,9 @@ _POLL_SECONDS = 0.2
 class Job:
     """One sequence of a batch and how it is run; fields as the options of ``warpslam run``.
 
-    name: Of the folder for its results. frames: Slice as (start, stop, step).
+    name: Of the folder for its results. frames: Slice as (start, stop, step). poses: Trajectory in the TUM format that
+    is taken as given. checkpoint_every: Frames between two checkpoints; None for none. A method that has none starts
+    again after a stop.
     """
 
     name: str
@@ -51,11 +54,15 @@ class Job:
     device: str | None = None
     seed: int = 0
     truth_mesh: str | None = None
+    method: str = DEFAULT_METHOD
+    poses: str | None = None
+    checkpoint_every: int | None = None
 
     @property
     def settings_hash(self) -> str:
-        """Of all that decides on the result: the fields and the version of warpslam."""
-        text = json.dumps({**asdict(self), "warpslam": __version__}, sort_keys=True)
+        """Of all that decides on the result: the version of warpslam and the fields, but for the checkpoints."""
+        fields = {name: value for name, value in asdict(self).items() if name != "checkpoint_every"}
+        text = json.dumps({**fields, "warpslam": __version__}, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def to_dict(self) -> dict[str, Any]:
@@ -142,13 +149,16 @@ def check_jobs(jobs: Sequence[Job]) -> None:
     """Refuse settings that can't work before any worker starts. A folder that can't be read only fails its own job.
 
     Raises:
-        ConfigError: A preset, a setting or a number of the batch is not usable.
+        ConfigError: A method, a preset, a setting or a number of the batch is not usable.
     """
     from warpslam.config import PRESETS, Config
 
     if not jobs:
         raise ConfigError("the batch is empty: name folders, or a manifest with --manifest")
     for job in jobs:
+        check_method(job.method)
+        if job.checkpoint_every is not None and job.checkpoint_every < 1:
+            raise ConfigError(f"checkpoint_every = {job.checkpoint_every} of {job.name} must be at least 1 frame")
         Config.from_preset(job.preset or next(iter(PRESETS)), list(job.overrides))
 
 

@@ -11,6 +11,7 @@ from warpslam.errors import ConfigError
 
 FIELDS = (
     "path", "name", "dataset", "camera", "preset", "frames", "set", "decoders", "device", "seed", "truth_mesh",
+    "method", "poses", "checkpoint_every",
 )  # fmt: skip
 
 
@@ -18,7 +19,7 @@ def read_manifest(path: str | Path, common: Job) -> list[Job]:
     """Jobs of a yaml file: ``sequences``, each a path or a mapping, and ``defaults`` for all of them.
 
     Fields are path, name, dataset, camera, preset, frames ("A:B:STEP"), set (a list of KEY=VALUE), decoders, device,
-    seed and truth_mesh. Paths are relative to the file.
+    seed, truth_mesh, method, poses and checkpoint_every (0 for none). Paths are relative to the file.
 
     Args:
         path: File.
@@ -65,14 +66,14 @@ def _with_fields(job: Job, fields: Any, path: Path, where: str) -> Job:
             if not isinstance(value, str):
                 raise ConfigError(f"{path}: {where}: frames = {value!r} must be a text in quotes, such as '0:200'")
             values["frames"] = parse_slice(value)
-        elif name == "seed":
+        elif name in ("seed", "checkpoint_every"):
             if isinstance(value, bool) or not isinstance(value, int):
-                raise ConfigError(f"{path}: {where}: seed = {value!r} must be a whole number")
-            values["seed"] = value
+                raise ConfigError(f"{path}: {where}: {name} = {value!r} must be a whole number")
+            values[name] = None if name == "checkpoint_every" and value == 0 else value
         elif not isinstance(value, str):
             raise ConfigError(f"{path}: {where}: {name} = {value!r} must be a text")
         else:
-            is_path = name in ("path", "decoders", "truth_mesh")
+            is_path = name in ("path", "decoders", "truth_mesh", "poses")
             values[name] = str((path.parent / Path(value).expanduser()).resolve()) if is_path else value
     return replace(job, **values)
 

@@ -91,6 +91,7 @@ def execute(job: Job, output: Path, report: Report, memory_gb: float | None = No
 def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) -> str:
     from warpslam.config import Config
     from warpslam.evaluation import load_mesh
+    from warpslam.method import has_checkpoints
     from warpslam.pipeline import run
     from warpslam.revisit import open_source
     from warpslam.run_folder import Source
@@ -98,8 +99,7 @@ def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) 
     source = Source(job.path, job.dataset, job.camera)
     sequence = open_source(source)
     config = Config.from_preset(job.preset or sequence.preset, list(job.overrides))
-    if job.decoders:
-        config = config.model_copy(update={"decoders": job.decoders})
+    config = config.with_files(job.decoders, job.poses)
     truth_mesh = load_mesh(job.truth_mesh) if job.truth_mesh else None
     device = job.device or _device_of(slot)
     _compile(device)
@@ -111,7 +111,8 @@ def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) 
 
     result = run(
         sequence, config, folder, frames=slice(*job.frames), device=device, seed=job.seed, source=source,
-        truth_mesh=truth_mesh, on_frame=on_frame,
+        truth_mesh=truth_mesh, on_frame=on_frame, method=job.method, poses=job.poses,
+        checkpoint_every=job.checkpoint_every if has_checkpoints(job.method) else None,
     )  # fmt: skip
     return INTERRUPTED if result.status == "interrupted" else FINISHED
 

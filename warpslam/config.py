@@ -273,6 +273,13 @@ class Config(_Group):
             _merge(values, _parse_override(override))
         return self.from_dict(values)
 
+    def with_files(self, decoders: str | None = None, poses: str | Path | None = None) -> Config:
+        """These settings for a run that is given a decoder checkpoint, or a trajectory whose poses are taken as they
+        are; None changes nothing.
+        """
+        tracking = self.tracking.model_copy(update={"use_given_poses": True}) if poses else self.tracking
+        return self.model_copy(update={"decoders": decoders or self.decoders, "tracking": tracking})
+
     @classmethod
     def load(cls, path: str | Path) -> Config:
         """Read settings from a yaml file.

@@ -93,7 +93,23 @@ def load_method(name: str, path: Path, device: str | None) -> Method:
     return _class_of(name).load(path, device=device)
 
 
+def check_method(name: str) -> None:
+    """Whether there is a method of this name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if name not in METHODS:
+        raise ConfigError(f"method {name!r} is unknown; choose one of {', '.join(METHODS)}")
+
+
+def has_checkpoints(name: str) -> bool:
+    """Whether a run of this method can be resumed from a checkpoint; one that can't starts again."""
+    return name == DEFAULT_METHOD
+
+
 def _class_of(name: str) -> Any:
+    check_method(name)
     if name == DEFAULT_METHOD:
         from warpslam.slam import Slam
 
@@ -102,8 +118,6 @@ def _class_of(name: str) -> Any:
         from warpslam.baselines.imap import Imap
 
         return Imap
-    if name == "tsdf":
-        from warpslam.baselines.tsdf import Tsdf
+    from warpslam.baselines.tsdf import Tsdf
 
-        return Tsdf
-    raise ConfigError(f"method {name!r} is unknown; choose one of {', '.join(METHODS)}")
+    return Tsdf

@@ -36,7 +36,7 @@ from warpslam.evaluation import (
     trajectory_metrics,
     write_tum,
 )
-from warpslam.method import DEFAULT_METHOD, build_method, load_method
+from warpslam.method import DEFAULT_METHOD, build_method, check_method, has_checkpoints, load_method
 from warpslam.output import LogFile, kernel_cache_errors, output_error
 from warpslam.resume import (
     RunProgress,
@@ -804,7 +804,8 @@ def _device_name(device: str | None) -> str:
 def _check_checkpoint_settings(
     every: int | None, map_path: str | Path | None, localize_only: bool, method: str
 ) -> None:
-    if method != DEFAULT_METHOD and (every is not None or map_path is not None):
+    check_method(method)
+    if not has_checkpoints(method) and (every is not None or map_path is not None):
         raise ConfigError(f"method {method} has no checkpoints and takes no map: leave out checkpoint_every and map")
     if every is not None and every < 1:
         raise ConfigError(f"checkpoint_every = {every} must be at least 1 frame")

@@ -10,7 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from warpslam.cli.common import EXIT_INTERRUPTED, add_command, add_run_options, duration, parse_frames
+from warpslam.cli.common import (
+    EXIT_INTERRUPTED,
+    add_command,
+    add_method_option,
+    add_run_options,
+    duration,
+    parse_frames,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -18,6 +25,7 @@ if TYPE_CHECKING:
     from warpslam.batch import Job, JobStatus
 
 EXIT_UNFINISHED = 1
+CHECKPOINT_EVERY = 50
 _LINES_A_JOB = 10
 
 
@@ -33,6 +41,11 @@ def add(commands: Any) -> None:
     batch.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
     batch.add_argument("--preset", help="settings to start from (default: each dataset's)")
     batch.add_argument("--frames", type=parse_frames, default=slice(None), metavar="A:B:STEP", help="frames to use")
+    add_method_option(batch)
+    batch.add_argument(
+        "--checkpoint-every", type=int, default=CHECKPOINT_EVERY, metavar="N",
+        help=f"frames between two checkpoints, from which an unfinished sequence goes on ({CHECKPOINT_EVERY}; 0: none)",
+    )  # fmt: skip
     add_run_options(batch, output="folder of the batch, with a folder a sequence and the summary (default: batch)")
 
 
@@ -76,7 +89,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
         name="", path="", dataset=options.dataset, camera=options.camera, preset=options.preset,
         frames=(frames.start, frames.stop, frames.step), overrides=tuple(options.overrides),
         decoders=str(Path(options.decoders).resolve()) if options.decoders else None, device=options.device,
-        seed=options.seed,
+        seed=options.seed, method=options.method, checkpoint_every=options.checkpoint_every or None,
     )  # fmt: skip
     paths = [Path(folder).expanduser().resolve() for folder in options.folders]
     jobs = [replace(common, name=path.name, path=str(path)) for path in paths]

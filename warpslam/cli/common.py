@@ -8,6 +8,8 @@ from collections.abc import Callable
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from warpslam.method import DEFAULT_METHOD, METHODS
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -46,6 +48,11 @@ def add_slam_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--decoders", metavar="FILE", help="decoder checkpoint (default: the package's own)")
     parser.add_argument("--device", help="cpu, cuda:0, ... (default: a GPU if there is one)")
     parser.add_argument("--seed", type=int, default=0, help="seed of every random choice (0)")
+
+
+def add_method_option(parser: argparse.ArgumentParser) -> None:
+    """Which method runs."""
+    parser.add_argument("--method", choices=METHODS, default=DEFAULT_METHOD, help=f"what runs ({DEFAULT_METHOD})")
 
 
 def parse_frames(text: str) -> slice:

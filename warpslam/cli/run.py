@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from warpslam.cli.common import (
     EXIT_INTERRUPTED,
     add_command,
+    add_method_option,
     add_run_options,
     add_sequence_options,
     duration,
@@ -20,7 +21,6 @@ from warpslam.cli.common import (
     quiet_warp,
     warnings_on_stderr,
 )
-from warpslam.method import DEFAULT_METHOD, METHODS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -47,18 +47,19 @@ def add(commands: Any) -> None:
     run.add_argument("--map", metavar="FILE", help="start from the map of another run (its folder, or the file)")
     run.add_argument("--localize", action="store_true", help="with --map: only track the camera, leave the map alone")
     run.add_argument("--no-check", action="store_true", help="run even if the checks of the input find an error")
-    _add_method_options(run)
+    add_method_option(run)
+    _add_poses_option(run)
     _add_checkpoint_option(run)
     add_run_options(run)
 
     demo = add_command(commands, "demo", _demo, "SLAM in a small rendered room; needs no data")
-    _add_method_options(demo)
+    add_method_option(demo)
+    _add_poses_option(demo)
     _add_checkpoint_option(demo)
     add_run_options(demo)
 
 
-def _add_method_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--method", choices=METHODS, default=DEFAULT_METHOD, help=f"what runs ({DEFAULT_METHOD})")
+def _add_poses_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--poses", metavar="FILE", help="take the poses of this TUM trajectory, such as an earlier run's, as given"
     )
@@ -161,11 +162,7 @@ def _execute(
 ) -> int:
     from warpslam.pipeline import run
 
-    if options.decoders:
-        config = config.model_copy(update={"decoders": options.decoders})
-    if options.poses:
-        tracking = config.tracking.model_copy(update={"use_given_poses": True})
-        config = config.model_copy(update={"tracking": tracking})
+    config = config.with_files(options.decoders, options.poses)
     with warnings_on_stderr(), _progress(sequence.name) as (on_frame, on_module):
         result = run(
             sequence,
