@@ -16,15 +16,11 @@ MIN_GAP = 5
 """A gap is at least this many times as long as the time between two frames usually is."""
 
 
-def read_figures(folder: RunFolder, *, with_gap: bool = False) -> dict[str, float]:
-    """What a run has of the figures of `warpslam.bench.studies.METRICS`, by their keys.
-
-    Args:
-        folder: Finished run.
-        with_gap: Look for a gap and add the figures of what came after it.
+def read_figures(folder: RunFolder) -> dict[str, float]:
+    """What a finished run has of the figures of `warpslam.bench.studies.METRICS`, by their keys.
 
     Raises:
-        DatasetError: A file is missing or damaged, or there is no gap.
+        DatasetError: A file is missing or damaged.
     """
     metrics, timing = read_json(folder.metrics), read_json(folder.timing)
     surface = metrics.get("reconstruction", {})
@@ -40,8 +36,6 @@ def read_figures(folder: RunFolder, *, with_gap: bool = False) -> dict[str, floa
         "tracking": _mean_milliseconds(timing, "tracking"),
         "mapping": _mean_milliseconds(timing, "mapping"),
     }
-    if with_gap:
-        figures |= gap_figures(folder)
     return {key: value for key, value in figures.items() if value is not None}
 
 

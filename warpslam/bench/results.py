@@ -187,27 +187,36 @@ class StudyResult:
     def _direction(self, expectation: Expectation) -> Direction:
         metric = METRICS[expectation.metric]
         sides = [expectation.better, expectation.worse or expectation.better]
-        pairs, left_out = [], []
+        pairs: list[tuple[Summary, Summary]] = []
+        means: list[tuple[float, float]] = []
+        left_out = []
         for sequence in self.sequences:
             rows = [self.row(sequence, name) for name in sides]
-            summaries = [row.summary(metric) for row in rows if row is not None]
-            if len(summaries) == 2 and all(summary.mean is not None for summary in summaries):
-                pairs.append(summaries)
-            else:
+            first, second = (Summary.of(()) if row is None else row.summary(metric) for row in rows)
+            if first.mean is None or second.mean is None:
                 left_out.append(sequence)
+            else:
+                pairs.append((first, second))
+                means.append((first.mean, second.mean))
         if not pairs:
             return Direction(expectation, None, reason="no sequence has the figure of both sides")
-        better, worse = (statistics.fmean(pair[side].mean for pair in pairs) for side in (0, 1))
-        reason = f"without {', '.join(left_out)}" if left_out else ""
+        better, worse = (statistics.fmean(side) for side in zip(*means, strict=True))
+        notes = [f"without {', '.join(left_out)}"] if left_out else []
         if any(not outcome.is_finished for row in self.rows if row.variant.name in sides for outcome in row.outcomes):
-            reason = "; ".join(filter(None, [reason, "some runs failed"]))
+            notes.append("some runs failed")
+        reason = "; ".join(notes)
         if expectation.worse is None:
             return Direction(expectation, better == expectation.value, better, reason=reason)
         holds = better < worse if metric.lower_is_better else better > worse
-        spreads = [max(s.std for s in pair) for pair in pairs if all(s.std is not None for s in pair)]
-        gaps = [abs(pair[0].mean - pair[1].mean) for pair in pairs if all(s.std is not None for s in pair)]
-        is_clear = all(gap > spread for gap, spread in zip(gaps, spreads, strict=True)) if spreads else None
+        spreads = [_spread(first, second) for first, second in pairs]
+        known = [(abs(a - b), s) for (a, b), s in zip(means, spreads, strict=True) if s is not None]
+        is_clear = all(gap > spread for gap, spread in known) if known else None
         return Direction(expectation, holds, better, worse, is_clear, reason)
+
+
+def _spread(first: Summary, second: Summary) -> float | None:
+    """The larger of two standard deviations; None if one is not known."""
+    return None if first.std is None or second.std is None else max(first.std, second.std)
 
 
 def published_row(key: str | None, study: str, variant: str) -> Mapping[str, float | str]:

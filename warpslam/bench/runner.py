@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from warpslam.batch import FINISHED, INTERRUPTED, SKIPPED, Job, JobStatus, Update, run_batch
-from warpslam.bench.figures import read_figures
+from warpslam.bench.figures import gap_figures, read_figures
 from warpslam.bench.jobs import Entry, expand, render_missing, unique_jobs
 from warpslam.bench.results import Outcome, Row, StudyResult, published_row
 from warpslam.bench.suite import Suite
@@ -122,7 +122,9 @@ def _outcome(entry: Entry, output: Path, status: JobStatus, say: Say | None) -> 
     study, job = entry.study, entry.job
     if status.status not in (FINISHED, SKIPPED):
         return Outcome(job.name, entry.seed, status.status, status.message)
-    messages, figures, curve, protocol = [], {}, None, None
+    messages: list[str] = []
+    figures: dict[str, float] = {}
+    curve, protocol = None, None
     folder = RunFolder(output / RUNS / job.name)
     try:
         figures = read_figures(folder)
@@ -134,7 +136,7 @@ def _outcome(entry: Entry, output: Path, status: JobStatus, say: Say | None) -> 
         messages.append(str(error))
     try:
         if "after_gap" in {metric.key for metric in study.metrics}:
-            figures |= read_figures(folder, with_gap=True)
+            figures |= gap_figures(folder)
         if study.probe is not None and say is not None:
             from warpslam.bench.probes import measure
 

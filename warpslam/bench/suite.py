@@ -177,10 +177,10 @@ def _check(spec: SuiteSpec, where: str) -> None:
         if name not in STUDIES:
             raise ConfigError(f"{place}: there is no such study; known are {', '.join(STUDIES)}")
         study = study or StudySpec()
-        for sequence in study.sequences or ():
-            if sequence not in spec.sequences:
+        for wanted in study.sequences or ():
+            if wanted not in spec.sequences:
                 known = ", ".join(spec.sequences)
-                raise ConfigError(f"{place}.sequences: {sequence!r} is not among the suite's sequences: {known}")
+                raise ConfigError(f"{place}.sequences: {wanted!r} is not among the suite's sequences: {known}")
         names = [variant.name for variant in STUDIES[name].variants]
         for variant in study.variants or ():
             if variant not in names:
