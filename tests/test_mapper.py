@@ -47,6 +47,7 @@ def test_a_frozen_level_stays_as_it_began(frozen):
 
 def test_no_iteration_is_spent_on_a_frozen_middle_level():
     """The middle stage has nothing to optimise then, and becomes part of the fine one."""
+
     def stages(*overrides: str) -> list[str]:
         return Slam(CAMERA, Config.from_preset("default", overrides), "cpu")._mapper._schedule(10, refinement=False)
 

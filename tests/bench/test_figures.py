@@ -30,7 +30,7 @@ def test_units(tmp_path):
 
 
 def gap_run(folder: RunFolder, statuses: list[str], offset: float) -> RunFolder:
-    """A camera along x, 1 m a frame, one frame a second; the estimate is turned and, from frame 8 on, ``offset`` off."""
+    """A camera along x, 1 m and 1 s a frame; the estimate is turned and, from frame 8 on, ``offset`` off."""
     count = len(statuses)
     truth = np.tile(np.eye(4), (count, 1, 1))
     truth[:, 0, 3] = np.arange(count)

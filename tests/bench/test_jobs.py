@@ -14,7 +14,7 @@ from warpslam.run_folder import read_json
 
 
 def test_settings_of_a_job(write_suite, tmp_path):
-    """Later ones win: suite, sequence, study, variant; given poses and the true surface only where a study needs them."""
+    """Later ones win: suite, sequence, study, variant; given poses and true surface only where a study needs them."""
     path = write_suite(
         set=["mapping.iterations=1", "mapping.every=3", "mapping.pixels=99"],
         sequences={

@@ -54,7 +54,11 @@ def test_figures_that_are_known_without_a_run():
 
 def result(**rows: tuple[tuple, tuple]) -> StudyResult:
     """Of the colour study: sequence = (with, without)."""
-    made = [Row(name, v, outcomes(*ates)) for name, pair in rows.items() for v, ates in zip(COLOR.variants, pair)]
+    made = [
+        Row(name, variant, outcomes(*ates))
+        for name, pair in rows.items()
+        for variant, ates in zip(COLOR.variants, pair, strict=True)
+    ]
     return StudyResult(COLOR, tuple(made))
 
 
