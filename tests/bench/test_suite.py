@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from warpslam.bench.jobs import expand, unique_jobs
 from warpslam.bench.studies import STUDIES
 from warpslam.bench.suite import SHIPPED, published_figures, read_suite
 from warpslam.config import Config
@@ -49,8 +52,12 @@ def test_files_that_can_not_be_read(tmp_path):
 
 
 def test_paths_are_relative_to_the_file_or_to_the_data(write_suite, tmp_path):
-    """Without a folder for the data the file's own counts."""
+    """Without a folder for the data the file's own counts; of several, the first that has it, or else the first."""
     path = write_suite()
+    (tmp_path / "b" / "room").mkdir(parents=True)
+    both = read_suite(str(path), tmp_path / "a", tmp_path / "b")
+    assert both.resolve("room") == str(tmp_path / "b" / "room")
+    assert both.resolve("hall") == str(tmp_path / "a" / "hall")
     assert read_suite(str(path)).resolve("data/room") == str(tmp_path / "data" / "room")
     assert read_suite(str(path), tmp_path / "other").resolve("room") == str(tmp_path / "other" / "room")
 
@@ -61,6 +68,13 @@ def test_shipped_suites_make_every_study():
         suite = read_suite(name)
         assert [study.name for study, _ in suite.studies()] == list(STUDIES)
         assert all(sequence.render is not None for sequence in suite.spec.sequences.values())
+
+
+def test_suites_of_the_repository():
+    """The one for real data can be read, and its runs are as few as its head says."""
+    suite = read_suite(str(Path(__file__).parents[2] / "tools" / "suites" / "real.yaml"))
+    assert [study.name for study, _ in suite.studies()] == list(STUDIES)
+    assert len(unique_jobs(expand(suite, Path("out")))) <= 36
 
 
 def test_studies_fit_the_settings_and_the_paper():

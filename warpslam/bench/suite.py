@@ -94,12 +94,13 @@ class SuiteSpec(_Section):
 class Suite:
     """A suite that has been read and checked.
 
-    name: Of the file, without its ending. base: Folder that its paths are relative to. source: File, or "shipped".
+    name: Of the file, without its ending. bases: Folders that its paths are looked for in, one after the other.
+    source: File, or "shipped".
     """
 
     name: str
     spec: SuiteSpec
-    base: Path
+    bases: tuple[Path, ...]
     source: str
 
     def studies(self, wanted: Iterable[str] | None = None) -> list[tuple[Study, StudySpec]]:
@@ -120,16 +121,19 @@ class Suite:
         return {name: self.spec.sequences[name] for name in study.sequences or self.spec.sequences}
 
     def resolve(self, path: str | None) -> str | None:
-        """A path of the suite as an absolute one."""
-        return None if path is None else str((self.base / Path(path).expanduser()).resolve())
+        """A path of the suite as an absolute one: where it exists, or else in the first folder."""
+        if path is None:
+            return None
+        places = [(base / Path(path).expanduser()).resolve() for base in self.bases]
+        return str(next((place for place in places if place.exists()), places[0]))
 
 
-def read_suite(name: str, data: str | Path | None = None) -> Suite:
+def read_suite(name: str, *data: str | Path) -> Suite:
     """Read a suite by its file, or one that comes with the package by its name.
 
     Args:
         name: File, or one of `SHIPPED`.
-        data: Folder that paths of sequences are relative to; the file's own by default.
+        data: Folders that paths are looked for in; the file's own by default.
 
     Raises:
         ConfigError: There is no such suite, it can't be read, or a field is unknown or has a value that does not fit.
@@ -137,14 +141,14 @@ def read_suite(name: str, data: str | Path | None = None) -> Suite:
     path = Path(name)
     if not path.is_file() and name in SHIPPED:
         text = resources.files("warpslam.bench").joinpath("suites", f"{name}.yaml").read_text(encoding="utf-8")
-        base, source, where = Path(data or "."), "shipped", f"suite {name}"
+        own, source, where = Path("."), "shipped", f"suite {name}"
     else:
         try:
             text = path.read_text(encoding="utf-8")
         except (OSError, ValueError) as error:
             shipped = ", ".join(SHIPPED)
             raise ConfigError(f"suite {name} can't be read ({error}); give a file, or one of: {shipped}") from error
-        base, source, where = Path(data) if data is not None else path.parent, str(path), str(path)
+        own, source, where = path.parent, str(path), str(path)
     try:
         content = yaml.safe_load(text)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -154,7 +158,7 @@ def read_suite(name: str, data: str | Path | None = None) -> Suite:
     except ValidationError as error:
         raise ConfigError(f"{where}: " + "; ".join(map(_say, error.errors()))) from None
     _check(spec, where)
-    return Suite(path.stem, spec, base, source)
+    return Suite(path.stem, spec, tuple(map(Path, data)) or (own,), source)
 
 
 @cache

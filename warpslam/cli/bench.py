@@ -19,7 +19,10 @@ def add(commands: Any) -> None:
     bench.add_argument("suite", metavar="SUITE", help="yaml file, or the name of a suite that comes along: quick")
     bench.add_argument("-o", "--output", metavar="DIR", help="folder of the bench (default: bench/NAME)")
     bench.add_argument("--studies", metavar="A,B", help="only these studies of the suite")
-    bench.add_argument("--data", metavar="DIR", help="what the suite's paths are relative to (default: its own folder)")
+    bench.add_argument(
+        "--data", action="append", default=[], metavar="DIR",
+        help="where the suite's paths are looked for; may be repeated (default: the folder of the suite)",
+    )  # fmt: skip
     bench.add_argument("--workers", type=int, default=1, metavar="N", help="runs at a time (1)")
     bench.add_argument("--memory-gb", type=float, metavar="GB", help="stop a worker that takes more memory than this")
     bench.add_argument("--list", action="store_true", help="say what would be run, and run nothing")
@@ -31,7 +34,7 @@ def _bench(options: argparse.Namespace) -> int:
     from warpslam.bench.suite import read_suite
     from warpslam.cli.common import quiet_warp
 
-    suite = read_suite(options.suite, options.data)
+    suite = read_suite(options.suite, *options.data)
     output = Path(options.output or Path("bench") / suite.name)
     studies = [name.strip() for name in options.studies.split(",")] if options.studies else None
     if options.list:
