@@ -65,8 +65,8 @@ def _study(bench: Bench, result: StudyResult) -> Html:
     study = result.study
     content = [
         element("p", study.text, " ", how_to_read(result)),
-        table(header(result), table_rows(result), "numbers bench"),
-        element("figure", void("img", src=_png(plot_path(bench.folder, result)), alt=study.title, class_="thumbnail")),
+        table(*_joined(header(result), table_rows(result)), "numbers"),
+        element("figure", _plot(bench, result)),
     ]
     directions = result.directions()
     if directions:
@@ -111,5 +111,15 @@ def _link(folder: Path, run: str) -> Html | str:
     return element("a", run, href=quote(report.relative_to(folder).as_posix())) if report.is_file() else run
 
 
-def _png(path: Path) -> str:
-    return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
+def _joined(head: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+    """Sequence and variant as one column, which names the row."""
+    joined = [[f"{sequence} · {variant}", *rest] for sequence, variant, *rest in rows]
+    return [f"{head[0]} · {head[1]}", *head[2:]], joined
+
+
+def _plot(bench: Bench, result: StudyResult) -> Html:
+    content = base64.b64encode(plot_path(bench.folder, result).read_bytes()).decode("ascii")
+    # Not wider than it is: a single chart would fill the page.
+    style = "width:auto;max-width:100%"
+    source = f"data:image/png;base64,{content}"
+    return void("img", src=source, alt=result.study.title, class_="thumbnail", style=style)

@@ -45,6 +45,8 @@ def plot_study(path: str | Path, result: StudyResult) -> None:
     for axes in grid.flat:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
+    if "paper" in handles:
+        handles["paper"] = handles.pop("paper")  # last
     if handles:
         figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(path, dpi=110, format="png")
@@ -73,6 +75,7 @@ def _draw_bars(axes: Any, result: StudyResult, metric: Metric) -> None:
                 axes.annotate("none" if any(o.is_finished for o in row.outcomes) else "failed", (place, 0),
                               rotation=90, ha="center", va="bottom", fontsize=8, color="tab:red")  # fmt: skip
     axes.set_xticks(range(len(sequences)), sequences)
+    axes.set_xlim(-0.5, len(sequences) - 0.5)
     axes.set_ylim(bottom=0)
     axes.set_title(metric.heading, fontsize=10)
 

@@ -125,6 +125,9 @@ def trouble(rows: Sequence[Row]) -> list[str]:
 def how_to_read(result: StudyResult) -> str:
     """What the numbers of a table are."""
     text = "Mean ± standard deviation over seeds" if any(len(row.outcomes) > 1 for row in result.rows) else "One seed"
+    protocols = _protocols(result)
+    if len(protocols) == 1:
+        text += f"; surfaces are compared under the culling protocol {protocols[0]}"
     if any(row.published for row in result.rows):
         text += f"; rows marked ({PAPER}) are what the paper prints for the same data"
     return f"{text}."
@@ -166,8 +169,13 @@ def _line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
 
 
+def _protocols(result: StudyResult) -> list[str]:
+    return sorted({row.protocol for row in result.rows if row.protocol})
+
+
 def _has_protocol(result: StudyResult) -> bool:
-    return any(metric.is_reconstruction for metric in result.metrics)
+    """Whether a column has to say which protocol a row's figures hold under; one for all stands above the table."""
+    return len(_protocols(result)) > 1
 
 
 def _published(row: Row, metric: Metric) -> str:
