@@ -139,6 +139,8 @@ class MappingConfig(_Group):
     depth_start: bool = Field(
         True, description="middle features that are seen for the first time start from the measured depth, not as noise"
     )
+    optimize_middle: bool = Field(True, description="off: middle features stay as they began, for ablations (Fig. 9)")
+    optimize_fine: bool = Field(True, description="off: fine features stay as they began, for ablations (Fig. 9)")
     frustum_selection: bool = Field(True, description="only vertices in the current frustum change (A.1)")
     frustum_margin: float = Field(0.5, ge=0, description="selected vertices reach this far behind the surface [m]")
     coarse: bool = Field(True, description="optimise the coarse level, which forecasts unseen geometry")

@@ -5,8 +5,8 @@ near the vertex. But what a vertex of the middle level has to say is known as so
 the measured surface. So a vertex that is seen for the first time starts from a feature f(s) = base + s * slope, s being
 its signed distance along the ray (z-depth, positive behind the surface). Base and slope are fitted once per decoder, so
 that the decoder reads s times a steepness from f(s), wherever the vertex lies. Trilinear interpolation of such features
-is the feature of the interpolated distance: planes come out exactly, and the optimiser starts from a surface that is off
-by centimetres where the decoder or the scene is not so simple.
+is the feature of the interpolated distance: planes come out exactly, and the optimiser starts from a surface that is
+off by centimetres where the decoder or the scene is not so simple.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from warpslam.kernels.grid import Vec32
 from warpslam.profiling import phase
 from warpslam.scene import FeatureGrid
 
-# Of the logit by the distance, and the largest distances, in vertex spacings; a cell that the surface passes through has
-# corners up to its diagonal behind it.
+# Of the logit by the distance, and the largest distances, in vertex spacings; a cell that the surface passes through
+# has corners up to its diagonal behind it.
 STEEPNESS = 2.56
 TRUNCATION = 1.6
 REACH = 1.75
@@ -72,9 +72,7 @@ class DepthStart:
         )
 
 
-def fit_signed_distance(
-    weights: DecoderWeights, steepness: float, truncation: float
-) -> tuple[np.ndarray, np.ndarray]:
+def fit_signed_distance(weights: DecoderWeights, steepness: float, truncation: float) -> tuple[np.ndarray, np.ndarray]:
     """Features on a line that a decoder reads as signed distance: logit(p, base + s * slope) ~ steepness * s.
 
     Least squares over points p and distances s, by Levenberg-Marquardt.
@@ -131,7 +129,7 @@ def _fit(
 def logit_and_derivative(
     tensors: dict[str, np.ndarray], points: np.ndarray, features: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Logits (N,) of a decoder at points (N, 3) [m] with features (N, 32), and their derivatives by the feature, (N, 32).
+    """Logits (N,) of a decoder at points (N, 3) [m] with features (N, 32), and their derivatives by those, (N, 32).
 
     tensors: By the reference's names, see `warpslam.decoders`.
     """

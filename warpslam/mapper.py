@@ -78,8 +78,10 @@ class Mapper:
         self._losses = wp.zeros(len(STAGES), dtype=float, device=device)
         self._changed: set[str] = set()
         self._depth_start: DepthStart | None = None
-        if config.depth_start:
+        if config.depth_start and config.optimize_middle:
             self._depth_start = DepthStart(scene.decoder_weights.middle, scene.grids["middle"].spacing)
+        wanted = {"middle": config.optimize_middle, "fine": config.optimize_fine}
+        self._frozen = {level for level, is_optimized in wanted.items() if not is_optimized}
 
     def map_first(
         self, images: ImagePool, frame: int, vector: np.ndarray, on_iteration: Callable | None = None
@@ -209,7 +211,9 @@ class Mapper:
         if refinement:
             return ["color"] * iterations
         middle, fine = int(self.config.middle_share * iterations), int(self.config.fine_share * iterations)
-        return ["middle" if j <= middle else "fine" if j <= fine else "color" for j in range(iterations)]
+        # Without middle features to optimise the first stage is the one that optimises fine ones.
+        first = "middle" if self.config.optimize_middle else "fine"
+        return [first if j <= middle else "fine" if j <= fine else "color" for j in range(iterations)]
 
     @phase("keyframe selection")
     def _choose_window(
@@ -237,7 +241,9 @@ class Mapper:
         T_world_camera = pose_from_vector(vector)
         for level, optimizer in self._grids.items():
             grid = self.scene.grids[level]
-            if level == "coarse" or everything or not self.config.frustum_selection:
+            if level in self._frozen:
+                mask = np.zeros(grid.row_count, bool)
+            elif level == "coarse" or everything or not self.config.frustum_selection:
                 mask = np.ones(grid.row_count, bool)
             else:
                 mask = select_in_frustum(

@@ -9,11 +9,11 @@ import sys
 from collections.abc import Sequence
 
 from warpslam import __version__
-from warpslam.cli import batch, check, evaluate, info, mesh, profile, render, report, run, warmup
+from warpslam.cli import batch, bench, check, evaluate, info, mesh, profile, render, report, run, warmup
 from warpslam.cli.common import EXIT_ERROR, EXIT_INTERRUPTED
 from warpslam.errors import WarpSlamError
 
-COMMANDS = (run, batch, check, evaluate, report, render, mesh, profile, warmup, info)
+COMMANDS = (run, batch, bench, check, evaluate, report, render, mesh, profile, warmup, info)
 """Modules with a function ``add(commands)``, in the order of ``warpslam --help``."""
 
 

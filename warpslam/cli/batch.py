@@ -60,7 +60,7 @@ def _batch(options: argparse.Namespace) -> int:
         from warpslam.output import output_error
 
         raise output_error(error, output) from error
-    with _progress() as on_update:
+    with progress() as on_update:
         if options.cluster:
             from warpslam.cluster import run_on_ray
 
@@ -98,7 +98,7 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
 
 
 @contextmanager
-def _progress() -> Iterator[Callable[[JobStatus], None]]:
+def progress() -> Iterator[Callable[[JobStatus], None]]:
     """A table that is kept up to date on a terminal, lines anywhere else."""
     if not sys.stdout.isatty():
         yield _Lines().show

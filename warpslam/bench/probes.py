@@ -1,0 +1,178 @@
+"""What studies measure besides whole runs, on a few frames of a run's sequence and with its settings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warpslam.batch import Job
+from warpslam.errors import DatasetError
+from warpslam.run_folder import read_json, write_json
+
+if TYPE_CHECKING:
+    from warpslam.config import Config
+    from warpslam.scene import FeatureGrid
+    from warpslam.sequences.base import Frame, RgbdSequence
+
+PROBE_FOLDER = "probes"
+CURVE_POINTS = 25
+MAPPING_CALLS = 3
+"""Mapping calls, after the first one, that `outside_change` looks at."""
+
+
+def measure(name: str, job: Job, output: Path) -> dict[str, Any]:
+    """Measure with the settings of a job, or read what was measured before with the same.
+
+    Returns:
+        ``figures`` by key, and whatever else the probe has.
+
+    Raises:
+        WarpSlamError: The sequence or a setting can't be used.
+    """
+    path = output / PROBE_FOLDER / f"{job.name}.{name}.json"
+    try:
+        known = read_json(path)
+        if known.get("settings") == job.settings_hash:
+            return known
+    except DatasetError:  # not there, or cut short
+        pass
+    result = {"settings": job.settings_hash, **PROBES[name](job)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, result)
+    return result
+
+
+def convergence(job: Job) -> dict[str, Any]:
+    """Mapping of the first frame alone: mean |measured - rendered depth| over its iterations (Fig. 9).
+
+    Returns:
+        ``figures``: "view_depth" at the end [cm]. ``curve``: [iteration, depth L1 [cm]] of about 25 moments.
+    """
+    import warp as wp
+
+    from warpslam.camera import vector_from_pose
+    from warpslam.decoders import load_decoders
+    from warpslam.frustum import measured_extent
+    from warpslam.images import read_images
+    from warpslam.keyframes import ImagePool
+    from warpslam.mapper import Mapper
+    from warpslam.rendering import render_image
+    from warpslam.scene import SceneMap
+
+    sequence, config, frames = _open(job)
+    first = next(frames, None)
+    if first is None:
+        raise DatasetError(f"{sequence.name}: none of the selected frames has a pose")
+    frame, T_world_camera = first
+    camera, device = sequence.intrinsics, wp.get_device(job.device)
+    rgb, depth = read_images(frame.rgb, frame.depth, camera, config.grid.max_depth, None)
+    scene = SceneMap(load_decoders(config.decoders), config.grid, device, job.seed)
+    scene.cover(*measured_extent(depth, T_world_camera, camera))
+    images = ImagePool(camera, device)
+    images.set(0, rgb, depth)
+    mapping = config.mapping.model_copy(update={"coarse": False})
+    mapper = Mapper(scene, camera, mapping, config.sampling, device, job.seed)
+    stride = -(-camera.width // 160)
+    measured = depth[::stride, ::stride]
+    valid = measured > 0
+    curve: list[list[float]] = []
+
+    def note(stage: str | None, iteration: int, count: int) -> None:
+        if stage is not None and iteration + 1 != count and (iteration + 1) % max(1, count // CURVE_POINTS):
+            return
+        image = render_image(
+            scene.arrays(), camera, T_world_camera, config.sampling, device, depth=depth, stride=stride
+        )
+        error = 100 * float(np.abs(image.depth - measured)[valid].mean())
+        curve.append([iteration + 1, error])
+
+    note(None, -1, mapping.first_iterations)
+    mapper.map_first(images, 0, vector_from_pose(T_world_camera), note)
+    return {"figures": {"view_depth": curve[-1][1]}, "curve": curve}
+
+
+def outside_change(job: Job) -> dict[str, Any]:
+    """What mapping calls after the first one do to features outside the frustum of their frame (A.1, Fig. D).
+
+    Poses are given and stay as they are.
+
+    Returns:
+        ``figures``: "outside", the largest change of a feature's component. ``levels``: The same by level, and the
+        share of the vertices outside that changed.
+    """
+    import warp as wp
+
+    from warpslam.frustum import select_in_frustum
+    from warpslam.images import read_images
+    from warpslam.keyframes import ImagePool
+    from warpslam.scene import FeatureGrid
+    from warpslam.slam import Slam
+
+    sequence, config, frames = _open(job)
+    settings = {"tracking.use_given_poses": "true", "mapping.bundle_adjustment": "false"}
+    config = config.updated([f"{name}={value}" for name, value in settings.items()])
+    camera, device = sequence.intrinsics, wp.get_device(job.device)
+    slam = Slam(camera, config, job.device, job.seed)
+    images = ImagePool(camera, device)
+    levels = {level: {"largest": 0.0, "changed": 0, "outside": 0} for level in ("middle", "fine", "color")}
+    every = config.mapping.every
+
+    def snapshot(level: str) -> FeatureGrid:
+        grid = slam.scene.grids[level]
+        copy = FeatureGrid(level, grid.spacing, grid.std, slam.seed, device)
+        copy.restore(grid.first, grid.shape, grid.features.numpy())
+        return copy
+
+    for number, (frame, T_world_camera) in enumerate(islice(frames, 1 + MAPPING_CALLS * every)):
+        before = {} if number == 0 else {level: snapshot(level) for level in levels}
+        result = slam.step(frame.rgb, frame.depth, frame.timestamp, T_world_camera)
+        slam.wait()
+        if number % every or number == 0 or result.status != "OK":
+            continue
+        # The depth as the mapper has it, rounded.
+        images.set(0, *read_images(frame.rgb, frame.depth, camera, config.grid.max_depth, None))
+        depth = wp.array(images.depth_image(0), dtype=float, device=device)
+        for level, old in before.items():
+            grid = slam.scene.grids[level]
+            old.update_from(grid, None)
+            inside = select_in_frustum(
+                grid.lattice, grid.shape, camera, result.T_world_camera, depth, config.mapping.frustum_margin
+            )
+            change = np.abs(grid.features.numpy() - old.features.numpy()).max(axis=1)[~inside]
+            known = levels[level]
+            known["largest"] = max(known["largest"], float(change.max(initial=0.0)))
+            known["changed"] += int((change > 0).sum())
+            known["outside"] += len(change)
+    if not any(known["outside"] for known in levels.values()):
+        raise DatasetError(f"{sequence.name}: no frame but the first was mapped, so nothing can have changed")
+    return {"figures": {"outside": max(known["largest"] for known in levels.values())}, "levels": levels}
+
+
+PROBES: dict[str, Callable[[Job], dict[str, Any]]] = {"convergence": convergence, "outside": outside_change}
+"""Probes by the names that studies have for them."""
+
+
+def _open(job: Job) -> tuple[RgbdSequence, Config, Iterator[tuple[Frame, np.ndarray]]]:
+    """Sequence, settings, and those of the selected frames that have a pose, with it."""
+    from warpslam.config import Config
+    from warpslam.pipeline import GivenPoses, load_kernels, select_frames
+    from warpslam.revisit import open_source
+    from warpslam.run_folder import Source
+
+    sequence = open_source(Source(job.path, job.dataset, job.camera))
+    config = Config.from_preset(job.preset or sequence.preset, list(job.overrides)).with_files(job.decoders, None)
+    load_kernels(sequence, job.device)
+    given = None if job.poses is None else GivenPoses.read(job.poses)
+
+    def frames() -> Iterator[tuple[Frame, np.ndarray]]:
+        for index in select_frames(sequence, slice(*job.frames)):
+            frame = sequence[index]
+            pose = frame.T_world_camera if given is None else given.at(frame.timestamp)
+            if pose is not None and np.isfinite(pose).all():
+                yield frame, pose
+
+    return sequence, config, frames()
