@@ -113,8 +113,7 @@ def outside_change(job: Job) -> dict[str, Any]:
     from warpslam.slam import Slam
 
     sequence, config, frames = _open(job)
-    settings = {"tracking.use_given_poses": "true", "mapping.bundle_adjustment": "false"}
-    config = config.updated([f"{name}={value}" for name, value in settings.items()])
+    config = config.updated(["tracking.use_given_poses=true"])
     camera, device = sequence.intrinsics, wp.get_device(job.device)
     slam = Slam(camera, config, job.device, job.seed)
     images = ImagePool(camera, device)
@@ -124,7 +123,7 @@ def outside_change(job: Job) -> dict[str, Any]:
     def snapshot(level: str) -> FeatureGrid:
         grid = slam.scene.grids[level]
         copy = FeatureGrid(level, grid.spacing, grid.std, slam.seed, device)
-        copy.restore(grid.first, grid.shape, grid.features.numpy())
+        copy.restore(grid.first, grid.shape, grid.features.numpy(), grid.started.numpy())
         return copy
 
     for number, (frame, T_world_camera) in enumerate(islice(frames, 1 + MAPPING_CALLS * every)):
