@@ -137,7 +137,9 @@ class MappingConfig(_Group):
     loss: Literal["sum", "mean"] = Field("sum", description="sums over rays (released code) or means (Eq. 8-9)")
     train_color_decoder: bool = Field(True, description="the colour decoder is optimised with the map")
     depth_start: bool = Field(
-        True, description="middle features that are seen for the first time start from the measured depth, not as noise"
+        False,
+        description="middle features that are seen for the first time start from the measured depth, not as noise: "
+        "completer maps where poses are given; a tracked camera may drift with it",
     )
     optimize_middle: bool = Field(True, description="off: middle features stay as they began, for ablations (Fig. 9)")
     optimize_fine: bool = Field(True, description="off: fine features stay as they began, for ablations (Fig. 9)")
@@ -337,7 +339,7 @@ _PAPER: dict[str, Any] = {"optimizer": "adam", "final_rate_factor": 1.0}
 
 
 def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, Any]:
-    mapping = {"first_iterations": 1500, "depth_start": False, **groups.pop("mapping", {})}
+    mapping = {"first_iterations": 1500, **groups.pop("mapping", {})}
     return {"sampling": {"jitter": False}, "tracking": {**_PAPER, **(tracking or {})}, "mapping": mapping, **groups}
 
 

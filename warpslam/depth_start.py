@@ -7,6 +7,9 @@ its signed distance along the ray (z-depth, positive behind the surface). Base a
 that the decoder reads s times a steepness from f(s), wherever the vertex lies. Trilinear interpolation of such features
 is the feature of the interpolated distance: planes come out exactly, and the optimiser starts from a surface that is
 off by centimetres where the decoder or the scene is not so simple.
+
+That is for given poses. A tracked camera believes a sharp surface, and at the border of what was mapped the start is
+sharp and wrong: it may drift with its own guesses.
 """
 
 from __future__ import annotations

@@ -29,8 +29,7 @@ class FeatureGrid:
     first: World lattice index of vertex 0, int64 (3,).
     shape: Vertices per axis.
     features: Array of `Vec32`, one row a vertex (`warpslam.kernels.grid.row_of`).
-    started: What `warpslam.depth_start` has started, uint8 (rows,): 0 nothing, or `SEEN` or `GUESSED` of
-        `warpslam.kernels.frustum`.
+    started: 1 where `warpslam.depth_start` has started a vertex, uint8 (rows,).
     """
 
     def __init__(self, level: str, spacing: float, std: float, seed: int, device: wp.Device) -> None:

@@ -12,10 +12,6 @@ import warp as wp
 
 from warpslam.kernels.grid import Lattice, Vec32, row_of
 
-# What `start_from_depth` knows of a vertex.
-SEEN = wp.constant(wp.uint8(1))
-GUESSED = wp.constant(wp.uint8(2))
-
 
 @wp.func
 def bilinear_depth(image: wp.array2d(dtype=float), u: float, v: float) -> float:
@@ -102,10 +98,10 @@ def start_from_depth(
     started: wp.array(dtype=wp.uint8),
     features: wp.array(dtype=Vec32),
 ):
-    """Vertices seen for the first time, or seen to be free after they were thought to lie behind a surface."""
+    """Vertices seen for the first time. Once started, a vertex is the optimiser's."""
     i, j, k = wp.tid()
     row = row_of(lattice, i, j, k)
-    if selected[row] == wp.uint8(0) or started[row] == SEEN:
+    if selected[row] == wp.uint8(0) or started[row] != wp.uint8(0):
         return
     spacing = wp.cw_div(wp.vec3(1.0, 1.0, 1.0), lattice.inverse_spacing)
     p = lattice.origin + wp.cw_mul(wp.vec3(float(i), float(j), float(k)), spacing)
@@ -121,7 +117,7 @@ def start_from_depth(
     if measured <= 0.0:
         return
     distance = q[2] - measured
-    if distance > reach or (started[row] == GUESSED and distance > 0.0):
+    if distance > reach:
         return
-    started[row] = wp.where(distance > 0.0, GUESSED, SEEN)
+    started[row] = wp.uint8(1)
     features[row] = base + wp.clamp(distance, -truncation, truncation) * slope
