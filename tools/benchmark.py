@@ -6,7 +6,8 @@ A room is rendered (640x480), its first frame mapped, and then each phase is tim
 paper's Adam, and Gauss-Newton), mapping iterations by stage (1000 rays, five frames), a whole mapping call (60
 iterations with selection, coarse level and bundle adjustment) and a part of the first frame. `torch` is
 `tools/benchmarking/torch_slam.py`: the same iteration, built as the original is. Medians of the repeats; the last
-column is theirs over ours. Also measured: the machine's peak for single-precision matrix products.
+column is theirs over ours. Also measured: the machine's peak for single-precision matrix products, and what a tracking
+iteration takes when each of its kernels has one thread alone, which is the time of launching and of Python.
 """
 
 from __future__ import annotations
@@ -15,11 +16,13 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import torch
+import warp as wp
 from benchmarking.torch_slam import Level, TorchSlam
 
 from warpslam.camera import Intrinsics, vector_from_pose
@@ -113,6 +116,44 @@ def alternate(pairs: dict[str, tuple[Callable, Callable]], repeats: int) -> dict
     return result
 
 
+@contextmanager
+def one_thread_a_kernel() -> Iterator[None]:
+    """Recorded launches run the first of their threads only."""
+    original, bounds = wp.Launch.launch, {}
+
+    def launch(self: wp.Launch, *arguments: object) -> None:
+        if id(self) not in bounds:
+            full = self.bounds
+            self.set_dim((1,) * self.kernel.adj.kernel_dim if self.kernel.adj.kernel_dim else 1)
+            bounds[id(self)] = self, full, self.bounds
+        _, full, small = bounds[id(self)]
+        self.params[0] = small
+        try:
+            original(self, *arguments)
+        finally:
+            self.params[0] = full
+
+    wp.Launch.launch = launch
+    try:
+        yield
+    finally:
+        wp.Launch.launch = original
+        for command, full, _ in bounds.values():
+            command.bounds = full
+
+
+def launching_share(ours: Ours, optimizer: str, repeats: int) -> float:
+    """Time of 100 tracking iterations with one thread a kernel over that of whole ones: medians, in turns."""
+
+    def small() -> None:
+        with one_thread_a_kernel():
+            ours.track(optimizer, 100)
+
+    ours.track(optimizer, 100)  # records the launches, which must be whole ones
+    launching, whole = alternate({"": (small, lambda: ours.track(optimizer, 100))}, repeats)[""]
+    return launching / whole
+
+
 def matrix_peak(size: int = 1024, repeats: int = 20) -> float:
     """GFLOP/s of single-precision matrix products on all threads, best of the repeats."""
     a, b = torch.randn(2, size, size)
@@ -172,6 +213,7 @@ def main(arguments: list[str] | None = None) -> int:
     divide = {name: n if name.startswith(("tracking", "mapping, ")) else 1 for name in pairs}
     times = alternate(pairs, options.repeats)
     peak = matrix_peak()
+    shares = {optimizer: launching_share(ours, optimizer, options.repeats) for optimizer in ("adam", "gauss_newton")}
     rows = {}
     print("| phase | warpslam [ms] | torch [ms] | ratio |\n|---|---|---|---|")
     for name, (a, b) in times.items():
@@ -181,8 +223,11 @@ def main(arguments: list[str] | None = None) -> int:
         f"matrix products: {peak:.0f} GFLOP/s on {options.threads} threads; kernels compiled in "
         f"{ours.slam.compile_seconds:.1f} s"
     )
+    for optimizer, share in shares.items():
+        print(f"launching and Python in a tracking iteration, {optimizer}: {share:.1%}")
     if options.out:
-        options.out.write_text(json.dumps({"phases": rows, "matrix_gflops": peak}, indent=1))
+        result = {"phases": rows, "matrix_gflops": peak, "launching_share": shares}
+        options.out.write_text(json.dumps(result, indent=1))
     return 0
 
 
