@@ -7,7 +7,7 @@ paper's Adam, and Gauss-Newton), mapping iterations by stage (1000 rays, five fr
 iterations with selection, coarse level and bundle adjustment) and a part of the first frame. `torch` is
 `tools/benchmarking/torch_slam.py`: the same iteration, built as the original is. Medians of the repeats; the last
 column is theirs over ours. Also measured: the machine's peak for single-precision matrix products, and what a tracking
-iteration takes when each of its kernels has one thread alone, which is the time of launching and of Python.
+iteration takes when its kernels have no thread, which is the time of launching and of Python.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +27,7 @@ from benchmarking.torch_slam import Level, TorchSlam
 from warpslam.camera import Intrinsics, vector_from_pose
 from warpslam.config import Config
 from warpslam.frustum import measured_extent
+from warpslam.launching import Launcher
 from warpslam.slam import Slam
 from warpslam.synthetic import SyntheticSequence
 
@@ -116,42 +116,37 @@ def alternate(pairs: dict[str, tuple[Callable, Callable]], repeats: int) -> dict
     return result
 
 
-@contextmanager
-def one_thread_a_kernel() -> Iterator[None]:
-    """Recorded launches run the first of their threads only."""
-    original, bounds = wp.Launch.launch, {}
-
-    def launch(self: wp.Launch, *arguments: object) -> None:
-        if id(self) not in bounds:
-            full = self.bounds
-            self.set_dim((1,) * self.kernel.adj.kernel_dim if self.kernel.adj.kernel_dim else 1)
-            bounds[id(self)] = self, full, self.bounds
-        _, full, small = bounds[id(self)]
-        self.params[0] = small
-        try:
-            original(self, *arguments)
-        finally:
-            self.params[0] = full
-
-    wp.Launch.launch = launch
-    try:
-        yield
-    finally:
-        wp.Launch.launch = original
-        for command, full, _ in bounds.values():
-            command.bounds = full
-
-
 def launching_share(ours: Ours, optimizer: str, repeats: int) -> float:
-    """Time of 100 tracking iterations with one thread a kernel over that of whole ones: medians, in turns."""
+    """Time of 100 tracking iterations whose kernels have no thread over that of whole ones: medians, in turns."""
+    commands: list[wp.Launch] = []
+    original = Launcher.command
 
-    def small() -> None:
-        with one_thread_a_kernel():
-            ours.track(optimizer, 100)
+    def command(self: Launcher, *arguments: object) -> wp.Launch:
+        commands.append(original(self, *arguments))
+        return commands[-1]
 
-    ours.track(optimizer, 100)  # records the launches, which must be whole ones
-    launching, whole = alternate({"": (small, lambda: ours.track(optimizer, 100))}, repeats)[""]
-    return launching / whole
+    def run() -> None:
+        ours.track(optimizer, 100)
+
+    ours.slam._tracker._launcher.forget()
+    Launcher.command = command
+    try:
+        run()  # records the launches
+    finally:
+        Launcher.command = original
+    whole = [recorded.bounds for recorded in commands]
+
+    def without_threads() -> None:
+        for recorded in commands:
+            recorded.set_dim((0,) * max(recorded.kernel.adj.kernel_dim, 1))
+        try:
+            run()
+        finally:
+            for recorded, bounds in zip(commands, whole, strict=True):
+                recorded.bounds = recorded.params[0] = bounds
+
+    launching, full = alternate({"": (without_threads, run)}, repeats)[""]
+    return launching / full
 
 
 def matrix_peak(size: int = 1024, repeats: int = 20) -> float:
