@@ -52,9 +52,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 def grow(ours: Ours, factor: float) -> None:
     """Make the box of a map ``factor`` times as large, sideways."""
-    low, high = ours.slam.scene.bounds
-    more = 0.5 * (high - low) * (np.sqrt(factor) - 1.0) * [1.0, 1.0, 0.0]
-    ours.slam.scene.cover(low - more, high + more)
+    scene = ours.slam.scene
+    low, high = scene.bounds
+    # `cover` adds the margin, which the box has.
+    more = 0.5 * (high - low) * (np.sqrt(factor) - 1.0) * [1.0, 1.0, 0.0] - scene.config.margin - 1e-6
+    scene.cover(low - more, high + more)
 
 
 if __name__ == "__main__":
