@@ -10,7 +10,7 @@ from warpslam.errors import DatasetError
 from warpslam.run_folder import RunFolder, write_json
 
 
-def fake_run(job: Job, folder: Path, report, watch, slot: int) -> str:
+def fake_run(job: Job, folder: Path, report, watch, slot: int) -> tuple[str, str]:
     """In place of `batch_worker._run`: ATE is 1 cm and 2 cm more a seed; iMAP fails, without colour frames are lost."""
     report({"compiled": True})
     if job.method == "imap":
@@ -28,7 +28,7 @@ def fake_run(job: Job, folder: Path, report, watch, slot: int) -> str:
     }
     write_json(run.metrics, metrics)
     write_json(run.timing, {"frames": []})
-    return FINISHED
+    return FINISHED, ""
 
 
 if __name__ == "__main__":
