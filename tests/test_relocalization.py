@@ -14,7 +14,7 @@ from warpslam.synthetic import SyntheticSequence
 
 CAMERA = Intrinsics(62.5, 62.5, 39.5, 29.5, 80, 60)
 SETTINGS = [
-    "tracking.pixels=200",
+    "tracking.pixels=300",
     "tracking.ignore_edge_u=3",
     "tracking.ignore_edge_v=3",
     "tracking.recovery_factor=3",
