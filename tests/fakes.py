@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,6 +14,13 @@ from warpslam.errors import DatasetError, MeshError
 from warpslam.sequences.base import Frame, RgbdSequence
 
 CAMERA = Intrinsics(20, 20, 15.5, 11.5, 32, 24)
+
+
+class Terminal(io.StringIO):
+    """Standard output that says it is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
 
 
 def true_pose(index: int) -> np.ndarray:

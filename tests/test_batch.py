@@ -15,6 +15,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.fakes import Terminal
 from warpslam import batch, cli
 from warpslam.batch import BatchState, Job, JobStatus, run_batch, split_cores, with_free_names
 from warpslam.batch_manifest import FIELDS, read_manifest
@@ -295,12 +296,6 @@ def test_command_names_method_and_checkpoints(tmp_path, monkeypatch, options, me
 
 def test_table_on_a_terminal(tmp_path, monkeypatch):
     """On a terminal a table is kept up to date, and ends as the summary."""
-    import io
-
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
     terminal = Terminal()
     monkeypatch.setattr("sys.stdout", terminal)
     monkeypatch.setenv("TERM", "xterm")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.fakes import FakeSequence, FakeSlam, wall
+from tests.fakes import FakeSequence, FakeSlam, Terminal, wall
 from warpslam import cli, demo, pipeline, revisit
 from warpslam.cli.common import parse_frames
 from warpslam.evaluation import read_tum
@@ -268,12 +268,6 @@ def test_version(capsys):
 
 def test_progress_bar_on_a_terminal(monkeypatch, faked, tmp_path):
     """On a terminal the rich bar is fed with the same figures and ends at the total."""
-    import io
-
-    class Terminal(io.StringIO):
-        def isatty(self):
-            return True
-
     terminal = Terminal()
     monkeypatch.setattr("sys.stdout", terminal)
     monkeypatch.setenv("TERM", "xterm")

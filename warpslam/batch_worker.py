@@ -100,7 +100,8 @@ def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) 
     from warpslam.config import Config
     from warpslam.evaluation import load_mesh
     from warpslam.method import has_checkpoints
-    from warpslam.pipeline import run
+    from warpslam.output import kernel_cache_errors
+    from warpslam.pipeline import load_kernels, run
     from warpslam.revisit import open_source
     from warpslam.run_folder import Source
 
@@ -110,7 +111,8 @@ def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) 
     config = config.with_files(job.decoders, job.poses)
     truth_mesh = load_mesh(job.truth_mesh) if job.truth_mesh else None
     device = job.device or _device_of(slot)
-    _compile(device)
+    with kernel_cache_errors():
+        load_kernels(sequence, device)
     report({"compiled": True})
 
     def on_frame(progress: Progress) -> None:
@@ -134,18 +136,6 @@ def _device_of(slot: int) -> str | None:
     wp.config.log_level = wp.LOG_WARNING
     devices = wp.get_cuda_devices()
     return str(devices[slot % len(devices)]) if devices else None
-
-
-def _compile(device: str | None) -> None:
-    import warp as wp
-
-    from warpslam.compilation import compile_kernels
-    from warpslam.output import kernel_cache_errors
-    from warpslam.run_setup import check_device
-
-    check_device(device)
-    with kernel_cache_errors():
-        compile_kernels(wp.get_device(device))
 
 
 class MemoryWatch:

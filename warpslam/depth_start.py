@@ -14,8 +14,6 @@ sharp and wrong: it may drift with its own guesses.
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 import warp as wp
 
@@ -88,18 +86,7 @@ def fit_signed_distance(weights: DecoderWeights, steepness: float, truncation: f
     Returns:
         base, slope [1/m]: float32 (32,) each.
     """
-    key = tuple(sorted((name, tensor.tobytes()) for name, tensor in weights.padded().tensors.items()))
-    return _fit(key, weights.level, steepness, truncation)
-
-
-@lru_cache(maxsize=8)
-def _fit(
-    key: tuple[tuple[str, bytes], ...], level: str, steepness: float, truncation: float
-) -> tuple[np.ndarray, np.ndarray]:
-    from warpslam.decoders import MAX_HIDDEN, expected_shapes
-
-    shapes = expected_shapes(level, MAX_HIDDEN)
-    tensors = {name: np.frombuffer(data, np.float32).reshape(shapes[name]).astype(np.float64) for name, data in key}
+    tensors = {name: tensor.astype(np.float64) for name, tensor in weights.padded().tensors.items()}
     rng = np.random.default_rng(0)
     points = rng.uniform(-_EXTENT, _EXTENT, (_POINTS, 3))
     s = rng.uniform(-truncation, truncation, (_POINTS, 1))

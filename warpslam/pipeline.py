@@ -6,7 +6,7 @@ import dataclasses
 import logging
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -168,9 +168,9 @@ def run(
     with log_file(folder.log, append=saved is not None):
         given = None if poses is None else GivenPoses.read(poses)
         run_ = _Run(
-            sequence, config, folder, selected, device, seed, source, truth_mesh, on_frame, on_module, method, given
-        )
-        run_.request, run_.checkpoint_every, run_.check_input = request, checkpoint_every, check_input
+            sequence, config, folder, selected, device, seed, source, truth_mesh, method, given, on_frame=on_frame,
+            on_module=on_module, check_input=check_input, request=request, checkpoint_every=checkpoint_every,
+        )  # fmt: skip
         if saved is not None:
             run_.go_on_from(saved)
         elif why_anew:
@@ -179,34 +179,21 @@ def run(
         return run_.execute()
 
 
+@dataclass(eq=False)
 class _Run(RunResults):
     """A run under way: the loop over the frames, and its checkpoints."""
 
-    def __init__(
-        self,
-        sequence: RgbdSequence,
-        config: Config,
-        folder: RunFolder,
-        selected: range,
-        device: str | None,
-        seed: int,
-        source: Source | None,
-        truth_mesh: trimesh.Trimesh | None,
-        on_frame: Callable[[Progress], None] | None,
-        on_module: Callable[[ModuleProgress], None] | None,
-        method: str,
-        given: GivenPoses | None,
-    ) -> None:
-        super().__init__(sequence, config, folder, selected, device, seed, source, truth_mesh, method, given)
-        self.on_frame, self.on_module = on_frame, on_module
-        self.check_input = True
-        self.request: RunRequest | None = None
-        self.checkpoint_every: int | None = None
-        self.saved: SavedRun | None = None
-        self.position = 0  # in the selection
-        self.resumed_count = 0  # results that came from a checkpoint
-        self.digests: dict[int, str] = {}
-        self.start = self.frames_start = 0.0
+    on_frame: Callable[[Progress], None] | None = None
+    on_module: Callable[[ModuleProgress], None] | None = None
+    check_input: bool = True
+    request: RunRequest | None = None
+    checkpoint_every: int | None = None
+    saved: SavedRun | None = None
+    position: int = 0  # in the selection
+    resumed_count: int = 0  # results that came from a checkpoint
+    digests: dict[int, str] = field(default_factory=dict)
+    start: float = 0.0
+    frames_start: float = 0.0
 
     def go_on_from(self, saved: SavedRun) -> None:
         """Take up a run at its checkpoint."""

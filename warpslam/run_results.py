@@ -13,6 +13,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,6 +53,7 @@ PANEL_COUNT = 4
 PANEL_WIDTH = 240  # [px], at most
 
 
+@dataclass(eq=False)
 class RunResults:
     """State of a run that `warpslam.pipeline` fills while it goes through the frames, and the files made of it.
 
@@ -60,35 +62,29 @@ class RunResults:
     metrics.json beside the figures of every run. seconds: By stage.
     """
 
-    def __init__(
-        self,
-        sequence: RgbdSequence,
-        config: Config,
-        folder: RunFolder,
-        selected: range,
-        device: str | None,
-        seed: int,
-        source: Source | None,
-        truth_mesh: trimesh.Trimesh | None,
-        method: str,
-        given: GivenPoses | None,
-    ) -> None:
-        self.method, self.given = method, given
-        self.sequence, self.config, self.folder, self.selected = sequence, config, folder, selected
-        self.device, self.seed, self.source, self.truth_mesh = device, seed, source, truth_mesh
-        self.modules: list[ModuleProgress] = []
-        self.slam: Method | None = None
-        self.status = "finished"
-        self.started = datetime.now().astimezone()
-        self.frame_indices: list[int] = []
-        self.truth_poses: list[np.ndarray] = []
-        self.results: list[FrameResult] = []
-        self.left_out: list[dict[str, Any]] = []
-        self.first_index = 0
-        self.seconds: dict[str, float] = defaultdict(float)
-        self.ate: AteResult | None = None
-        self.reconstruction: ReconstructionResult | None = None
-        self.metrics: dict[str, Any] = {}
+    sequence: RgbdSequence
+    config: Config
+    folder: RunFolder
+    selected: range
+    device: str | None
+    seed: int
+    source: Source | None
+    truth_mesh: trimesh.Trimesh | None
+    method: str
+    given: GivenPoses | None
+    modules: list[ModuleProgress] = field(default_factory=list)
+    slam: Method | None = None
+    status: str = "finished"
+    started: datetime = field(default_factory=lambda: datetime.now().astimezone())
+    frame_indices: list[int] = field(default_factory=list)
+    truth_poses: list[np.ndarray] = field(default_factory=list)
+    results: list[FrameResult] = field(default_factory=list)
+    left_out: list[dict[str, Any]] = field(default_factory=list)
+    first_index: int = 0
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    ate: AteResult | None = None
+    reconstruction: ReconstructionResult | None = None
+    metrics: dict[str, Any] = field(default_factory=dict)
 
     def _write_input(self) -> None:
         self.config.save(self.folder.config)

@@ -12,7 +12,6 @@ import yaml
 from warpslam.bench.results import Direction, StudyResult
 from warpslam.bench.tables import bench_facts, header, how_to_read, made_with, plot_path, table_rows, trouble
 from warpslam.report.page import Html, element, figures, join, missing, page, section, table, void, write_page
-from warpslam.run_folder import RunFolder
 
 if TYPE_CHECKING:
     from warpslam.bench.runner import Bench
@@ -76,7 +75,7 @@ def _study(bench: Bench, result: StudyResult) -> Html:
     if problems:
         content.append(element("div", [element("p", problem) for problem in problems], class_="failure"))
     runs = [
-        [row.sequence, row.variant.name, str(outcome.seed), outcome.status, _link(bench.folder, outcome.run)]
+        [row.sequence, row.variant.name, str(outcome.seed), outcome.status, _link(bench, outcome.run)]
         for row in result.rows
         for outcome in row.outcomes
     ]
@@ -106,9 +105,9 @@ def _verdict(direction: Direction) -> Html:
     return join(element("span", word, class_=f"status{kind}"), f" {rest}" if rest else None)
 
 
-def _link(folder: Path, run: str) -> Html | str:
-    report = RunFolder(folder / "runs" / run).report
-    return element("a", run, href=quote(report.relative_to(folder).as_posix())) if report.is_file() else run
+def _link(bench: Bench, run: str) -> Html | str:
+    report = bench.run_folder(run).report
+    return element("a", run, href=quote(report.relative_to(bench.folder).as_posix())) if report.is_file() else run
 
 
 def _joined(head: list[str], rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:

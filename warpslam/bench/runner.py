@@ -36,6 +36,10 @@ class Bench:
     statuses: tuple[JobStatus, ...]
     results: tuple[StudyResult, ...]
 
+    def run_folder(self, run: str) -> RunFolder:
+        """Folder of one of its runs."""
+        return RunFolder(self.folder / RUNS / run)
+
     @property
     def is_interrupted(self) -> bool:
         """Whether ctrl-C ended it early."""

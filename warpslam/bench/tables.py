@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from warpslam import __version__
 from warpslam.bench.results import Row, StudyResult, to_dict
 from warpslam.bench.studies import Metric
-from warpslam.run_folder import RunFolder, read_json, write_json
+from warpslam.run_folder import read_json, write_json
 
 if TYPE_CHECKING:
     from warpslam.bench.runner import Bench
@@ -48,7 +48,7 @@ def bench_facts(bench: Bench) -> dict[str, Any]:
     found: dict[str, set[str]] = {"device": set(), "platform": set(), "processors": set()}
     versions: dict[str, set[str]] = {}
     for job in bench.jobs:
-        file = RunFolder(bench.folder / "runs" / job.name).metrics
+        file = bench.run_folder(job.name).metrics
         metrics = read_json(file) if file.is_file() else {}
         for name, values in found.items():
             values.update([str(metrics[name])] if metrics.get(name) is not None else [])

@@ -10,7 +10,7 @@ centre.
 
 import warp as wp
 
-from warpslam.kernels.grid import Lattice, Vec32, row_of
+from warpslam.kernels.grid import Lattice, Vec32, row_of, vertex_position
 
 
 @wp.func
@@ -47,8 +47,7 @@ def project_vertices(
     """
     i, j, k = wp.tid()
     row = row_of(lattice, i, j, k)
-    spacing = wp.cw_div(wp.vec3(1.0, 1.0, 1.0), lattice.inverse_spacing)
-    p = lattice.origin + wp.cw_mul(wp.vec3(float(i), float(j), float(k)), spacing)
+    p = vertex_position(lattice, i, j, k)
     q = wp.transform_point(T_camera_world, p)
     # The released code divides by (z - 1e-5) with its camera looking along -z.
     depth = q[2] - 1.0e-5
@@ -73,8 +72,7 @@ def select_vertices(
 ):
     i, j, k = wp.tid()
     row = row_of(lattice, i, j, k)
-    spacing = wp.cw_div(wp.vec3(1.0, 1.0, 1.0), lattice.inverse_spacing)
-    p = lattice.origin + wp.cw_mul(wp.vec3(float(i), float(j), float(k)), spacing)
+    p = vertex_position(lattice, i, j, k)
     measured = looked_up[row]
     if measured == 0.0:
         measured = max_depth[0]
@@ -103,8 +101,7 @@ def start_from_depth(
     row = row_of(lattice, i, j, k)
     if selected[row] == wp.uint8(0) or started[row] != wp.uint8(0):
         return
-    spacing = wp.cw_div(wp.vec3(1.0, 1.0, 1.0), lattice.inverse_spacing)
-    p = lattice.origin + wp.cw_mul(wp.vec3(float(i), float(j), float(k)), spacing)
+    p = vertex_position(lattice, i, j, k)
     q = wp.transform_point(T_camera_world, p)
     if q[2] <= 0.0:
         return

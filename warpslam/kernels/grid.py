@@ -43,6 +43,13 @@ def row_of(lattice: Lattice, i: int, j: int, k: int) -> int:
 
 
 @wp.func
+def vertex_position(lattice: Lattice, i: int, j: int, k: int) -> wp.vec3:
+    """Where a lattice vertex lies [m]."""
+    spacing = wp.cw_div(wp.vec3(1.0, 1.0, 1.0), lattice.inverse_spacing)
+    return lattice.origin + wp.cw_mul(wp.vec3(float(i), float(j), float(k)), spacing)
+
+
+@wp.func
 def find_cell(lattice: Lattice, p: wp.vec3) -> Cell:
     cell = Cell()
     u = wp.cw_mul(p - lattice.origin, lattice.inverse_spacing)
