@@ -235,8 +235,10 @@ class RayBatch:
         }
         self.bits["coarse"] = self.bits["middle"]
         empty = wp.zeros((1, 1), dtype=Vec32, device=device)
+        self._no_errors = wp.zeros((1, 1), dtype=float, device=device)
         self._no_rows, self._no_selection = empty, wp.zeros(1, dtype=wp.uint8, device=device)
         self._activations = self._layer_grad = empty
+        self._layer_inputs = wp.zeros((1, 1, 1), dtype=float, device=device)
         self._motion: _MotionArrays | None = None
 
     # -- filling in the rays -------------------------------------------------------------------------------------
@@ -261,13 +263,19 @@ class RayBatch:
         *,
         edge_u: int = 0,
         edge_v: int = 0,
+        active: tuple[float, tuple[int, int], wp.array] | None = None,
     ) -> None:
         """Draw random pixels of the window's images (colour, depth, depth scale; see `warpslam.keyframes.ImagePool`).
+
+        active: Share of pixels that is not uniform, but follows the error of an image's cells; the number of cells
+            across and down; and running sums of the error, (frames, cells). See `warpslam.active_sampling`.
         """
         self.count = window.shape[0] * rays_per_frame
         rgb, depth, scale = images
         inputs = [self.seeds, self.iteration, rays_per_frame, window, edge_u, edge_v, *_camera_vectors(camera)]
-        inputs += [rgb, depth, scale, self.frame, self.direction_camera, self.measured_depth, self.measured_rgb]
+        share, cells, cumulative_error = active or (0.0, (1, 1), self._no_errors)
+        inputs += [rgb, depth, scale, share, wp.vec2i(*cells), cumulative_error]
+        inputs += [self.frame, self.direction_camera, self.measured_depth, self.measured_rgb]
         self.launcher.launch(rays.draw_pixels, self.count, inputs)
 
     def set_pixels(self, first_row: int, row_count: int, camera: Intrinsics, stride: int = 1) -> None:
@@ -430,6 +438,11 @@ class RayBatch:
             self._activations = wp.empty((size, 5), dtype=Vec32, device=self.device)
             if self.kernels.sums_weights_apart:
                 self._layer_grad = wp.empty((size, 14), dtype=Vec32, device=self.device)
+            else:
+                shape = (decoder.GROUP_SIZE * slice_count(self.device), decoder.GROUP_COLUMNS)
+                self._layer_inputs = wp.zeros((*shape, 32), dtype=float, device=self.device)
+                pointer = self._layer_inputs.ptr
+                self._layer_grad = wp.array(ptr=pointer, dtype=Vec32, shape=shape, device=self.device)
 
     def _adjoint(
         self, arrays: FieldArrays, stage: str, gradients: Gradients, thresholds: Thresholds
@@ -510,11 +523,14 @@ class RayBatch:
     ) -> Step:
         samples = self.sample_count
         buffers = self._no_rows if gradients.color_weights is None else gradients.color_weights
-        inputs = [first * samples, slot, self.weighty, self.weighty_count, *self._common(arrays, "color")]
+        blocks = self.kernels.color_blocks
+        inputs = [first * samples, slot, self.weighty, self.weighty_count, blocks, *self._common(arrays, "color")]
         inputs += [self.bits["color"], self.color_grad]
         inputs += [*self._grid_gradient(gradients, "color"), int(gradients.points), point_grad]
-        inputs += [int(gradients.color_weights is not None), self._activations, buffers, self._layer_grad]
-        return (self.kernels.color_backward, self.kernels.thread_count((stop - first) * samples), inputs)
+        inputs += [int(gradients.color_weights is not None), self._activations, buffers]
+        inputs += [self._layer_grad, self._layer_inputs]
+        threads = -(-self.kernels.thread_count((stop - first) * samples) // blocks)
+        return (self.kernels.color_backward, threads, inputs)
 
     # -- losses --------------------------------------------------------------------------------------------------
 

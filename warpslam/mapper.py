@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
+from warpslam.active_sampling import CELLS, CellErrors
 from warpslam.camera import Intrinsics, pose_from_vector, vector_from_pose
 from warpslam.config import MappingConfig, SamplingConfig
 from warpslam.depth_start import DepthStart
@@ -76,6 +77,9 @@ class Mapper:
         samples = sampling.stratified + sampling.surface
         self._batch = RayBatch(config.pixels, samples, device, self._launcher)
         self._losses = wp.zeros(len(STAGES), dtype=float, device=device)
+        self._errors: CellErrors | None = None
+        if config.active_share > 0:
+            self._errors = CellErrors(2 * config.window + 2, sampling, device, self._launcher)
         self._changed: set[str] = set()
         self._depth_start: DepthStart | None = None
         if config.depth_start and config.optimize_middle:
@@ -178,6 +182,9 @@ class Mapper:
         stages = self._schedule(iterations, refinement)
         self._batch.set_seeds([ray_seed(self.seed, 3, frame, n, round_) for n in range(len(stages))])
         for iteration, stage in enumerate(stages):
+            if self._errors is not None and (iteration == 0 or stage != stages[iteration - 1]):
+                seed = ray_seed(self.seed, 5, frame, iteration, round_)
+                self._errors.measure(self.scene.arrays(), images.arrays, slots, self._poses.poses, self.camera, seed)
 
             def iterate(stage: str = stage) -> None:
                 self._iterate(images, slots, stage, rate_factor, adjust, refinement)
@@ -268,7 +275,10 @@ class Mapper:
         )
         sampling = self.sampling
         with self._launcher.tape() as tape:
-            batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera)
+            active = None
+            if self._errors is not None:
+                active = config.active_share, CELLS, self._errors.cumulative
+            batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera, active=active)
             batch.cast(self._poses.poses, differentiate=gradients.points)
             batch.bound(arrays)
             batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)

@@ -121,7 +121,13 @@ def sample_point(
 
 
 BLOCK_SIZE = {"cpu": 4, "cuda": 1}
-"""Samples of a thread."""
+"""Samples of a block."""
+
+GROUP_SIZE = 16
+"""Samples that a CPU thread of `color_backward` sums weight gradients over before it adds them to memory."""
+
+GROUP_COLUMNS = 18
+"""Vectors that each of them stores for that."""
 
 
 def decoder_kernels(target: str) -> SimpleNamespace:
@@ -253,21 +259,27 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         return r
 
     @func
-    def any_wanted(wanted: Indices) -> bool:
-        result = bool(False)
-        for p in range(size):
-            if wanted[p] != 0:
-                result = True
-        return result
-
-    @func
-    def add_outer(grad: wp.array2d(dtype=Vec32), slot: int, row: int, x: Block, d: Block):
-        """grad[row + k] += sum over the block of x[k] d."""
-        for k in range(32):
-            total = Vec32()
-            for p in range(size):
-                total += x[p, k] * d[p]
-            grad[slot, row + k] = grad[slot, row + k] + total
+    def add_outer(
+        grad: wp.array2d(dtype=Vec32),
+        slot: int,
+        row: int,
+        inputs: wp.array3d(dtype=float),
+        x: int,
+        layer_grad: wp.array2d(dtype=Vec32),
+        d: int,
+    ):
+        """grad[row + k] += sum over a slice's group of x[k] d, both columns of what its samples stored."""
+        first = GROUP_SIZE * slot
+        # Two rows at a time share what is read of d.
+        for k in range(16):
+            even = Vec32()
+            odd = Vec32()
+            for q in range(GROUP_SIZE):
+                g = layer_grad[first + q, d]
+                even += inputs[first + q, x, 2 * k] * g
+                odd += inputs[first + q, x, 2 * k + 1] * g
+            grad[slot, row + 2 * k] = grad[slot, row + 2 * k] + even
+            grad[slot, row + 2 * k + 1] = grad[slot, row + 2 * k + 1] + odd
 
     @func
     def add_sum(grad: wp.array2d(dtype=Vec32), slot: int, row: int, d: Block):
@@ -630,12 +642,13 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         for p in range(size):
             color[samples[p]] = wp.vec3(red[p] + bias[0], green[p] + bias[1], blue[p] + bias[2])
 
-    @kernel
-    def color_backward(
+    @func
+    def color_block_backward(
+        block: int,
+        count: int,
         start: int,
         slot: int,
         listed: wp.array(dtype=int),
-        listed_count: wp.array(dtype=int),
         trips: int,
         sample_count: int,
         ray_origin: wp.array(dtype=wp.vec3),
@@ -656,12 +669,13 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         activations: wp.array2d(dtype=Vec32),
         weight_grad: wp.array2d(dtype=Vec32),
         layer_grad: wp.array2d(dtype=Vec32),
+        group_row: int,
     ):
-        thread = wp.tid()
-        count = listed_count[count_index(slot)]
-        if size * thread >= count:
-            return
-        samples = listed_samples(thread, count, start, listed)
+        """Adjoint of a block of `color_forward`; see `color_backward`.
+
+        group_row: On the CPU, the row of ``layer_grad`` that the first of its samples stores to.
+        """
+        samples = listed_samples(block, count, start, listed)
         wanted = Indices()
         red = Scalars()
         green = Scalars()
@@ -669,52 +683,52 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         for p in range(size):
             d = color_grad[samples[p]]
             # Rays without a residual have weighty samples, too.
-            if size * thread + p < count and (d[0] != 0.0 or d[1] != 0.0 or d[2] != 0.0):
+            if size * block + p < count and (d[0] != 0.0 or d[1] != 0.0 or d[2] != 0.0):
                 wanted[p] = 1
                 red[p] = d[0]
                 green[p] = d[1]
                 blue[p] = d[2]
-        if not any_wanted(wanted):
-            return
-        keep = int(0)
-        if wp.static(not on_cpu):
-            # Thousands of threads would queue for the same rows: store, and let `color_weights` sum.
-            keep = want_weights
+        rows = Indices(samples)
+        if wp.static(on_cpu):
+            for p in range(size):
+                rows[p] = group_row + p
         g4 = outer(red, W[OUT_32]) + outer(green, W[OUT_32 + 1]) + outer(blue, W[OUT_32 + 2])
-        store_rows(layer_grad, samples, 9, g4, keep)
+        store_rows(layer_grad, rows, 9, g4, want_weights)
         dc = matvec(Block(), g4, T, V_T + 128, trips)
         a4 = keep_active(g4, bits, samples, 4)
-        store_rows(layer_grad, samples, 4, a4, keep)
+        store_rows(layer_grad, rows, 4, a4, want_weights)
         g3 = matvec(Block(), a4, T, W4_T, trips)
-        store_rows(layer_grad, samples, 8, g3, keep)
+        store_rows(layer_grad, rows, 8, g3, want_weights)
         dc = matvec(dc, g3, T, V_T + 96, trips)
         a3 = keep_active(g3, bits, samples, 3)
-        store_rows(layer_grad, samples, 3, a3, keep)
+        store_rows(layer_grad, rows, 3, a3, want_weights)
         g2 = matvec(Block(), a3, T, W3_T, trips)
-        store_rows(layer_grad, samples, 7, g2, keep)
+        store_rows(layer_grad, rows, 7, g2, want_weights)
         dc = matvec(dc, g2, T, V_T + 64, trips)
         a2 = keep_active(g2, bits, samples, 2)
-        store_rows(layer_grad, samples, 2, a2, keep)
+        store_rows(layer_grad, rows, 2, a2, want_weights)
         g1 = matvec(Block(), a2, T, W2_T, trips)
-        store_rows(layer_grad, samples, 6, g1, keep)
+        store_rows(layer_grad, rows, 6, g1, want_weights)
         dc = matvec(dc, g1, T, V_T + 32, trips)
         a1 = keep_active(g1, bits, samples, 1)
-        store_rows(layer_grad, samples, 1, a1, keep)
+        store_rows(layer_grad, rows, 1, a1, want_weights)
         g0 = matvec(Block(), a1, T, W1_T, trips)
-        store_rows(layer_grad, samples, 5, g0, keep)
+        store_rows(layer_grad, rows, 5, g0, want_weights)
         dc = matvec(dc, g0, T, V_T, trips)
         a0 = keep_active(g0, bits, samples, 0)
-        store_rows(layer_grad, samples, 0, a0, keep)
+        store_rows(layer_grad, rows, 0, a0, want_weights)
         positions = positions_of(samples, sample_count, ray_origin, ray_direction, z)
         if want_grid != 0:
             add_to_grid(grid_grad, slot, selected, lattice, positions, wanted, dc)
         if want_point != 0:
             add_to_points(point_grad, samples, positions, wanted, lattice, features, W, T, dc, a0, a3, trips)
         if want_weights != 0:
+            store_rows(layer_grad, rows, 13, look_up(positions, lattice, features), want_weights)
             if wp.static(on_cpu):
-                # Each CPU thread owns a buffer that fits its cache: rank-one updates beat storing and multiplying
-                # later. Samples that are not wanted add zero, whatever activations they have.
-                c = look_up(positions, lattice, features)
+                # What the group's matrix products need besides, and the single rows at once. Samples that are not
+                # wanted add zero, whatever activations they have.
+                for layer in range(4):
+                    store_rows(layer_grad, rows, 14 + layer, load_rows(activations, samples, layer), want_weights)
                 h4 = load_rows(activations, samples, 4)
                 add_sum(weight_grad, slot, OUT_32, scaled(red, h4))
                 add_sum(weight_grad, slot, OUT_32 + 1, scaled(green, h4))
@@ -725,10 +739,6 @@ def decoder_kernels(target: str) -> SimpleNamespace:
                     bias[1] += green[p]
                     bias[2] += blue[p]
                 weight_grad[slot, OUT_32 + 3] = weight_grad[slot, OUT_32 + 3] + bias
-                add_outer(weight_grad, slot, W4, load_rows(activations, samples, 3), a4)
-                add_outer(weight_grad, slot, W3, load_rows(activations, samples, 2), a3)
-                add_outer(weight_grad, slot, W2, load_rows(activations, samples, 1), a2)
-                add_outer(weight_grad, slot, W1, load_rows(activations, samples, 0), a1)
                 add_sum(weight_grad, slot, BIAS, a0)
                 add_sum(weight_grad, slot, BIAS + 1, a1)
                 add_sum(weight_grad, slot, BIAS + 2, a2)
@@ -739,26 +749,82 @@ def decoder_kernels(target: str) -> SimpleNamespace:
                 add_sum(weight_grad, slot, FC_BIAS + 2, g2)
                 add_sum(weight_grad, slot, FC_BIAS + 3, g3)
                 add_sum(weight_grad, slot, FC_BIAS + 4, g4)
-                add_outer(weight_grad, slot, V, c, g0)
-                add_outer(weight_grad, slot, V + 32, c, g1)
-                add_outer(weight_grad, slot, V + 64, c, g2)
-                add_outer(weight_grad, slot, V + 96, c, g3)
-                add_outer(weight_grad, slot, V + 128, c, g4)
-                for chunk in range(3):
-                    e = embed(positions, W, chunk)
-                    add_outer(weight_grad, slot, E0 + 32 * chunk, e, a0)
-                    add_outer(weight_grad, slot, E3 + 32 * chunk, e, a3)
-                    da = angle_adjoint(positions, W, T, chunk, a0, a3, trips)
+            for chunk in range(3):
+                da = angle_adjoint(positions, W, T, chunk, a0, a3, trips)
+                if wp.static(on_cpu):
+                    store_rows(layer_grad, rows, 10 + chunk, embed(positions, W, chunk), want_weights)
                     for axis in range(3):
                         coordinate = Scalars()
                         for p in range(size):
                             coordinate[p] = positions[p, axis]
                         add_sum(weight_grad, slot, B + 3 * chunk + axis, scaled(coordinate, da))
-            else:
-                store_rows(layer_grad, samples, 13, look_up(positions, lattice, features), keep)
+                else:
+                    store_rows(layer_grad, rows, 10 + chunk, da, want_weights)
+
+    @kernel
+    def color_backward(
+        start: int,
+        slot: int,
+        listed: wp.array(dtype=int),
+        listed_count: wp.array(dtype=int),
+        blocks: int,
+        trips: int,
+        sample_count: int,
+        ray_origin: wp.array(dtype=wp.vec3),
+        ray_direction: wp.array(dtype=wp.vec3),
+        z: wp.array(dtype=float),
+        lattice: Lattice,
+        features: wp.array(dtype=Vec32),
+        W: wp.array(dtype=Vec32),
+        T: wp.array(dtype=Vec32),
+        bits: wp.array2d(dtype=wp.uint32),
+        color_grad: wp.array(dtype=wp.vec3),
+        want_grid: int,
+        selected: wp.array(dtype=wp.uint8),
+        grid_grad: wp.array2d(dtype=Vec32),
+        want_point: int,
+        point_grad: wp.array(dtype=wp.vec3),
+        want_weights: int,
+        activations: wp.array2d(dtype=Vec32),
+        weight_grad: wp.array2d(dtype=Vec32),
+        layer_grad: wp.array2d(dtype=Vec32),
+        layer_inputs: wp.array3d(dtype=float),
+    ):
+        """Adjoint of `color_forward`; a thread works on ``blocks`` blocks, on the CPU a group of `GROUP_SIZE` samples.
+
+        layer_grad: On the CPU a slice has the rows of one group, with a_0..a_4, g_0..g_4, the embedding (3 columns),
+            the feature and h_0..h_3 of its samples: the gradient of the weights is twice as large as a CPU's first
+            cache, so that a row of it is fetched once a group and not once a block. On CUDA thousands of threads would
+            queue for the same rows: all samples store, and `color_weights` sums.
+        layer_inputs: The same memory, one number an element (CPU).
+        """
+        thread = wp.tid()
+        count = listed_count[count_index(slot)]
+        if size * blocks * thread >= count:
+            return
+        for n in range(blocks):
+            block = blocks * thread + n
+            group_row = GROUP_SIZE * slot + size * n
+            if size * block < count:
+                color_block_backward(
+                    block, count, start, slot, listed, trips, sample_count, ray_origin, ray_direction, z, lattice,
+                    features, W, T, bits, color_grad, want_grid, selected, grid_grad, want_point, point_grad,
+                    want_weights, activations, weight_grad, layer_grad, group_row,
+                )  # fmt: skip
+            elif wp.static(on_cpu) and want_weights != 0:
+                # What an earlier group left there must not count again.
+                for p in range(size):
+                    for column in range(GROUP_COLUMNS):
+                        layer_grad[group_row + p, column] = Vec32()
+        if wp.static(on_cpu):
+            if want_weights != 0:
+                for layer in range(4):
+                    add_outer(weight_grad, slot, W1 + 32 * layer, layer_inputs, 14 + layer, layer_grad, 1 + layer)
+                for layer in range(5):
+                    add_outer(weight_grad, slot, V + 32 * layer, layer_inputs, 13, layer_grad, 5 + layer)
                 for chunk in range(3):
-                    da = angle_adjoint(positions, W, T, chunk, a0, a3, trips)
-                    store_rows(layer_grad, samples, 10 + chunk, da, keep)
+                    add_outer(weight_grad, slot, E0 + 32 * chunk, layer_inputs, 10 + chunk, layer_grad, 0)
+                    add_outer(weight_grad, slot, E3 + 32 * chunk, layer_inputs, 10 + chunk, layer_grad, 3)
 
     # -- coarse ----------------------------------------------------------------------------------------------------
 
@@ -925,7 +991,9 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         coarse_backward=coarse_backward,
         color_weights=color_weights,
         transpose_color_weights=transpose_color_weights,
-        # Threads of a launch over so many samples.
+        # Blocks of a thread of `color_backward`.
+        color_blocks=GROUP_SIZE // size if on_cpu else 1,
+        # Threads of a launch over so many samples, one block each.
         thread_count=lambda point_count: -(-point_count // size),
         # Whether `color_backward` leaves the sum of the weight gradient to `color_weights`.
         sums_weights_apart=not on_cpu,

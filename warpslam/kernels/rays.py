@@ -31,6 +31,19 @@ def rotation_from_quaternion(w: float, x: float, y: float, z: float) -> wp.mat33
     )  # fmt: skip
 
 
+@wp.func
+def pixel_direction(u: int, v: int, focal: wp.vec2, center: wp.vec2) -> wp.vec3:
+    return wp.vec3((float(u) - center[0]) / focal[0], (float(v) - center[1]) / focal[1], 1.0)
+
+
+@wp.func
+def cell_pixel(cell: int, cells: wp.vec2i, width: int, height: int, x: float, y: float) -> wp.vec2i:
+    """The pixel at (x, y), each in [0, 1), of a cell; cells[0] x cells[1] of them cover the image, row by row."""
+    u = (float(cell % cells[0]) + x) * float(width) / float(cells[0])
+    v = (float(cell // cells[0]) + y) * float(height) / float(cells[1])
+    return wp.vec2i(wp.min(int(u), width - 1), wp.min(int(v), height - 1))
+
+
 @wp.kernel(enable_backward=False)
 def draw_pixels(
     seeds: wp.array(dtype=int),
@@ -44,14 +57,19 @@ def draw_pixels(
     rgb_images: wp.array(dtype=wp.uint8, ndim=4),
     depth_images: wp.array(dtype=wp.uint16, ndim=3),
     depth_scales: wp.array(dtype=float),
+    active_share: float,
+    cells: wp.vec2i,
+    cumulative_error: wp.array2d(dtype=float),
     frame: wp.array(dtype=int),
     direction_camera: wp.array(dtype=wp.vec3),
     depth: wp.array(dtype=float),
     rgb: wp.array(dtype=wp.vec3),
 ):
-    """Uniform pixels, with replacement, inside the border; ``window[f]`` is the image slot of frame f of the window.
+    """Random pixels, with replacement; ``window[f]`` is the image slot of frame f of the window.
 
-    Seeds lie on the device, one an iteration, so that a recorded iteration draws other pixels when it is replayed.
+    Uniform inside the border, but for ``active_share`` of them, which fall on the image's cells in proportion to their
+    error. Seeds lie on the device, one an iteration, so that a recorded iteration draws other pixels when it is
+    replayed.
     """
     tid = wp.tid()
     f = tid // rays_per_frame
@@ -61,13 +79,77 @@ def draw_pixels(
     state = wp.rand_init(seeds[iteration[0]], tid)
     u = wp.randi(state, edge_u, width - edge_u)
     v = wp.randi(state, edge_v, height - edge_v)
+    if active_share > 0.0 and wp.randf(state) < active_share:
+        last = cells[0] * cells[1] - 1
+        wanted = wp.randf(state) * cumulative_error[f, last]
+        low = int(0)
+        high = int(last)
+        while low < high:
+            middle = (low + high) // 2
+            if cumulative_error[f, middle] > wanted:
+                high = middle
+            else:
+                low = middle + 1
+        x = wp.randf(state)
+        y = wp.randf(state)
+        pixel = cell_pixel(low, cells, width, height, x, y)
+        u = pixel[0]
+        v = pixel[1]
     frame[tid] = f
-    direction_camera[tid] = wp.vec3((float(u) - center[0]) / focal[0], (float(v) - center[1]) / focal[1], 1.0)
+    direction_camera[tid] = pixel_direction(u, v, focal, center)
     depth[tid] = float(depth_images[slot, v, u]) * depth_scales[slot]
     rgb[tid] = (
         wp.vec3(float(rgb_images[slot, v, u, 0]), float(rgb_images[slot, v, u, 1]), float(rgb_images[slot, v, u, 2]))
         / 255.0
     )
+
+
+@wp.kernel(enable_backward=False)
+def probe_pixels(
+    seeds: wp.array(dtype=int),
+    iteration: wp.array(dtype=int),
+    window: wp.array(dtype=int),
+    cells: wp.vec2i,
+    focal: wp.vec2,
+    center: wp.vec2,
+    depth_images: wp.array(dtype=wp.uint16, ndim=3),
+    depth_scales: wp.array(dtype=float),
+    frame: wp.array(dtype=int),
+    direction_camera: wp.array(dtype=wp.vec3),
+    depth: wp.array(dtype=float),
+):
+    """One random pixel in each cell of each image of the window: where to look for the error of the cell."""
+    tid = wp.tid()
+    f = tid // (cells[0] * cells[1])
+    slot = window[f]
+    state = wp.rand_init(seeds[iteration[0]], tid)
+    x = wp.randf(state)
+    y = wp.randf(state)
+    pixel = cell_pixel(tid % (cells[0] * cells[1]), cells, depth_images.shape[2], depth_images.shape[1], x, y)
+    frame[tid] = f
+    direction_camera[tid] = pixel_direction(pixel[0], pixel[1], focal, center)
+    depth[tid] = float(depth_images[slot, pixel[1], pixel[0]]) * depth_scales[slot]
+
+
+@wp.kernel(enable_backward=False)
+def accumulate_errors(
+    cell_count: int,
+    largest: float,
+    keep: wp.array(dtype=int),
+    measured_depth: wp.array(dtype=float),
+    depth: wp.array(dtype=float),
+    cumulative_error: wp.array2d(dtype=float),
+):
+    """Running sums of |D - D^|, at most ``largest``, over the cells of an image, one image a thread."""
+    f = wp.tid()
+    total = float(0.0)
+    for c in range(cell_count):
+        n = f * cell_count + c
+        # Where nothing errs, all cells are alike.
+        total += 1.0e-6
+        if keep[n] != 0 and measured_depth[n] > 0.0:
+            total += wp.min(wp.abs(measured_depth[n] - depth[n]), largest)
+        cumulative_error[f, c] = total
 
 
 @wp.kernel(enable_backward=False)
@@ -85,7 +167,7 @@ def grid_pixels(
     u = stride * (tid % width)
     v = stride * (first_row + tid // width)
     frame[tid] = 0
-    direction_camera[tid] = wp.vec3((float(u) - center[0]) / focal[0], (float(v) - center[1]) / focal[1], 1.0)
+    direction_camera[tid] = pixel_direction(u, v, focal, center)
 
 
 @wp.kernel
