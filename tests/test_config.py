@@ -40,6 +40,17 @@ def test_bad_override_is_refused_by_name(override, message):
         Config.from_preset("default", [override])
 
 
+@pytest.mark.parametrize("name", sorted(name for name in PRESETS if name.startswith("paper_")))
+def test_paper_presets_hold_what_our_defaults_change(name):
+    """The released code: keyframes every 50 frames, even samples, uniform pixels, Adam at a constant rate."""
+    config = Config.from_preset(name)
+    assert config.keyframes.every == 50 and not config.sampling.jitter
+    assert config.tracking.final_rate_factor == 1.0
+    if name != "paper_imap":  # has settings of its own for the rest
+        assert config.tracking.optimizer == "adam"
+        assert config.mapping.active_share == 0.0 and config.mapping.first_iterations == 1500
+
+
 def test_unknown_preset_lists_the_known():
     """The error offers the choices."""
     with pytest.raises(ConfigError, match="replica"):

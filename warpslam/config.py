@@ -114,6 +114,9 @@ class MappingConfig(_Group):
     enabled: bool = Field(True, description="off: the camera is only tracked in a map that was loaded")
     every: int = Field(5, ge=1, description="map every n-th frame")
     pixels: int = Field(1000, ge=16, le=200_000, description="rays per iteration over all frames of the window")
+    active_share: float = Field(
+        0.5, ge=0, le=1, description="share of the rays drawn where the map errs in depth; 0 = all uniform (paper)"
+    )
     window: int = Field(
         5, ge=1, le=64, description="frames optimised together: selected keyframes, the last one, the current frame"
     )
@@ -160,7 +163,7 @@ class KeyframeConfig(_Group):
     """Keyframe selection (Sec. 3.4)."""
 
     policy: Literal["interval", "information_gain"] = Field("interval", description="when a frame becomes a keyframe")
-    every: int = Field(50, ge=1, description="interval policy: frames between keyframes")
+    every: int = Field(20, ge=1, description="interval policy: frames between keyframes; the paper's code has 50")
     known_share: float = Field(
         0.65, gt=0, lt=1, description="information gain: insert when the map explains less than this share of pixels"
     )
@@ -339,15 +342,21 @@ _PAPER: dict[str, Any] = {"optimizer": "adam", "final_rate_factor": 1.0}
 
 
 def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, Any]:
-    mapping = {"first_iterations": 1500, **groups.pop("mapping", {})}
-    return {"sampling": {"jitter": False}, "tracking": {**_PAPER, **(tracking or {})}, "mapping": mapping, **groups}
+    mapping = {"first_iterations": 1500, "active_share": 0.0, **groups.pop("mapping", {})}
+    return {
+        "sampling": {"jitter": False},
+        "tracking": {**_PAPER, **(tracking or {})},
+        "mapping": mapping,
+        "keyframes": {"every": 50},
+        **groups,
+    }
 
 
 _TUM_GRID = {"middle_spacing": 0.16, "fine_spacing": 0.08, "color_spacing": 0.08}
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
-    "thorough": {"mapping": {"every": 2, "iterations": 90}, "keyframes": {"every": 20}},
+    "thorough": {"mapping": {"every": 2, "iterations": 90}},
     "replica": {"tracking": {"ignore_edge_u": 100, "ignore_edge_v": 100}},
     "scannet": {},
     "apartment": {},
@@ -370,6 +379,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     ),
     "paper_imap": {
         "sampling": {"jitter": False},
+        "keyframes": {"every": 50},
         "tracking": {"final_rate_factor": 1.0},
         "imap": {
             "tracking_pixels": 5000, "tracking_iterations": 50, "mapping_pixels": 5000, "mapping_rate": 2e-4,
