@@ -1,4 +1,4 @@
-"""Render a smooth RGB-D path around a point of a mesh and write it as a Replica-layout folder.
+"""Render a smooth RGB-D path around a point of a mesh, or through several, and write it as a Replica-layout folder.
 
 Example: python tools/render_mesh_sequence.py --mesh scene.obj --frames 120 --out house --size 640x480
 """
@@ -13,7 +13,7 @@ import numpy as np
 
 from warpslam.camera import Intrinsics
 from warpslam.errors import WarpSlamError
-from warpslam.synthetic import MeshRenderer, RenderedSequence, load_mesh, orbit, write_replica
+from warpslam.synthetic import MeshRenderer, RenderedSequence, load_mesh, orbit, walk, write_replica
 
 # The defaults look at the dining table of the furnished test house, from the kitchen's side of the room.
 ROOM = (6.6, 1.1)  # [m] point to look at, seen from above
@@ -51,6 +51,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--radius", type=float, default=RADIUS, help="horizontal distance to the point [m]")
     parser.add_argument("--start", type=float, default=START_ANGLE, help="direction of the first camera [deg]")
     parser.add_argument("--step", type=float, default=STEP, help="distance between frames [m]; negative = clockwise")
+    parser.add_argument(
+        "--through", type=pair(",", float), nargs="+", metavar="X,Y", help="walk through these points [m] instead"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the hand's sway")
     parser.add_argument("--device", help="Warp device that renders")
     return parser.parse_args(arguments)
@@ -61,6 +64,9 @@ def make_sequence(options: argparse.Namespace) -> RenderedSequence:
     width, height = options.size
     focal = options.focal or 525.0 * width / 640.0
     intrinsics = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
+    if options.through:
+        poses = walk(np.array(options.through), options.frames, eye_height=options.eye_height)
+        return _rendered(options, intrinsics, poses)
     poses = orbit(
         np.array([*options.room, options.eye_height]),
         (options.radius, options.radius),
@@ -70,7 +76,11 @@ def make_sequence(options: argparse.Namespace) -> RenderedSequence:
         aim=options.target_height,
         phase=np.random.default_rng(options.seed).uniform(0, 2 * np.pi),
     )
-    return RenderedSequence("mesh", MeshRenderer(load_mesh(options.mesh), intrinsics, device=options.device), poses)
+    return _rendered(options, intrinsics, poses)
+
+
+def _rendered(options: argparse.Namespace, camera: Intrinsics, poses: np.ndarray) -> RenderedSequence:
+    return RenderedSequence("mesh", MeshRenderer(load_mesh(options.mesh), camera, device=options.device), poses)
 
 
 def main(arguments: list[str] | None = None) -> int:

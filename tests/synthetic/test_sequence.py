@@ -14,7 +14,15 @@ from PIL import Image
 from warpslam.camera import Intrinsics
 from warpslam.errors import DatasetError, InputError
 from warpslam.sequences.base import Frame, RgbdSequence
-from warpslam.synthetic import SyntheticSequence, contact_sheet, make_room, orbit, room_trajectory, write_replica
+from warpslam.synthetic import (
+    SyntheticSequence,
+    contact_sheet,
+    make_room,
+    orbit,
+    room_trajectory,
+    walk,
+    write_replica,
+)
 
 CAMERA = Intrinsics(50.0, 50.0, 31.5, 23.5, 64, 48)
 
@@ -192,3 +200,29 @@ def test_house_mesh_renders(data_dir):
     assert (depth > 0).mean() > 0.999
     assert 1 < np.median(depth) < 4
     assert len(np.unique(rgb.reshape(-1, 3), axis=0)) > 300
+
+
+def test_walk_goes_through_its_points():
+    """Steady steps at the given height, close by every waypoint, looking ahead and a little down."""
+    waypoints = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 3.0], [5.0, 3.5]])
+    poses = walk(waypoints, 200, eye_height=1.4)
+    moved, turned = steps(poses)
+    np.testing.assert_allclose(moved, moved.mean(), rtol=0.03)
+    assert turned.max() < 4.0
+    np.testing.assert_allclose(poses[:, 2, 3], 1.4)
+    for point in waypoints:
+        assert np.linalg.norm(poses[:, :2, 3] - point, axis=1).min() < 0.05
+    np.testing.assert_allclose(poses[[0, -1], :2, 3], waypoints[[0, -1]], atol=1e-9)
+    forward = poses[:-10, :3, 2]
+    ahead = np.diff(poses[:, :3, 3], axis=0)[:190]
+    cosine = np.sum(forward * ahead, axis=1) / np.linalg.norm(ahead, axis=1)
+    # Into a bend it looks before it goes.
+    assert cosine.min() > 0.4 and np.median(cosine) > 0.9
+    assert (forward[:, 2] < 0).all() and forward[:, 2].min() > -0.3
+
+
+@pytest.mark.parametrize(("waypoints", "frames"), [([[0, 0]], 5), ([[0, 0], [0, 0]], 5), ([[0, 0], [1, 0]], 0)])
+def test_a_walk_needs_a_way(waypoints, frames):
+    """One point, no distance, or no frame."""
+    with pytest.raises(InputError, match="waypoints"):
+        walk(np.array(waypoints), frames)

@@ -10,7 +10,7 @@ from warpslam.synthetic.noise import sensor_noise
 from warpslam.synthetic.render import MeshRenderer, load_mesh
 from warpslam.synthetic.rooms import Room, make_room
 from warpslam.synthetic.sequence import RenderedSequence, SyntheticSequence, write_replica
-from warpslam.synthetic.trajectory import look_at, orbit, room_trajectory
+from warpslam.synthetic.trajectory import look_at, orbit, room_trajectory, walk
 
 __all__ = [
     "SEQUENCE_KINDS",
@@ -28,6 +28,7 @@ __all__ = [
     "orbit",
     "room_trajectory",
     "sensor_noise",
+    "walk",
     "write_replica",
     "write_sequence",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from warpslam.errors import InputError
 from warpslam.synthetic.rooms import Room
@@ -81,6 +82,50 @@ def orbit(
         sideways = np.array([-np.sin(angle), np.cos(angle), 0.0])
         poses[index] = look_at(eye, target + 0.8 * sway * bob[1] * sideways + [0.0, 0.0, 1.5 * sway * bob[2]])
     return poses
+
+
+def walk(
+    waypoints: np.ndarray,
+    frame_count: int,
+    *,
+    eye_height: float = EYE_HEIGHT,
+    look_ahead: float = 1.5,
+    drop: float = 0.35,
+) -> np.ndarray:
+    """Walk along a smooth curve through points at a steady pace, looking along the way and a little down.
+
+    Args:
+        waypoints: Points of the path seen from above [m], shape (n, 2), n >= 2.
+        frame_count: Number of poses, spread evenly over the length of the path.
+        eye_height: Height of the camera [m].
+        look_ahead: The camera looks at the point of the path that is so far ahead [m]; at the end, straight on.
+        drop: That point lies so far below the camera [m].
+
+    Returns:
+        T_world_camera, float64, shape (frame_count, 4, 4), OpenCV axes.
+
+    Raises:
+        InputError: fewer than two waypoints, two alike in a row, or no frame.
+    """
+    waypoints = np.asarray(waypoints, dtype=np.float64)
+    legs = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
+    if frame_count < 1 or len(legs) < 1 or legs.min() <= 0:
+        raise InputError("a walk needs a frame, and at least two waypoints, no two alike in a row")
+    curve = CubicSpline(np.concatenate([[0.0], np.cumsum(legs)]), waypoints, bc_type="natural")
+    knots = np.linspace(0.0, legs.sum(), 50 * len(waypoints))
+    fine = curve(knots)
+    direction = fine[-1] - fine[-2]
+    direction /= np.linalg.norm(direction)
+    fine = np.concatenate([fine, fine[-1:] + 2.0 * look_ahead * direction])
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(fine, axis=0), axis=1))])
+    here = np.linspace(0.0, length[-2], frame_count)
+
+    def at(distance: np.ndarray, height: float) -> np.ndarray:
+        x, y = (np.interp(distance, length, fine[:, axis]) for axis in range(2))
+        return np.column_stack([x, y, np.full(len(distance), height)])
+
+    eyes, targets = at(here, eye_height), at(here + look_ahead, eye_height - drop)
+    return np.stack([look_at(eye, target) for eye, target in zip(eyes, targets, strict=True)])
 
 
 def room_trajectory(room: Room, frame_count: int, seed: int = 0, progress: np.ndarray | None = None) -> np.ndarray:
