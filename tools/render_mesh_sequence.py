@@ -37,6 +37,11 @@ def pair(separator: str, kind: type):
     return parse
 
 
+def points(text: str) -> np.ndarray:
+    """Parser of points, for argparse: shape (n, 2)."""
+    return np.array([pair(",", float)(point) for point in text.split()])
+
+
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
@@ -52,8 +57,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--start", type=float, default=START_ANGLE, help="direction of the first camera [deg]")
     parser.add_argument("--step", type=float, default=STEP, help="distance between frames [m]; negative = clockwise")
     parser.add_argument(
-        "--through", type=pair(",", float), nargs="+", metavar="X,Y", help="walk through these points [m] instead"
+        "--through", type=points, metavar='"X,Y X,Y ..."', help="walk through these points [m] instead"
     )
+    parser.add_argument("--max-depth", type=float, default=100.0, help="range of the depth camera [m]")
     parser.add_argument("--seed", type=int, default=0, help="seed of the hand's sway")
     parser.add_argument("--device", help="Warp device that renders")
     return parser.parse_args(arguments)
@@ -64,8 +70,8 @@ def make_sequence(options: argparse.Namespace) -> RenderedSequence:
     width, height = options.size
     focal = options.focal or 525.0 * width / 640.0
     intrinsics = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
-    if options.through:
-        poses = walk(np.array(options.through), options.frames, eye_height=options.eye_height)
+    if options.through is not None:
+        poses = walk(options.through, options.frames, eye_height=options.eye_height)
         return _rendered(options, intrinsics, poses)
     poses = orbit(
         np.array([*options.room, options.eye_height]),
@@ -80,7 +86,8 @@ def make_sequence(options: argparse.Namespace) -> RenderedSequence:
 
 
 def _rendered(options: argparse.Namespace, camera: Intrinsics, poses: np.ndarray) -> RenderedSequence:
-    return RenderedSequence("mesh", MeshRenderer(load_mesh(options.mesh), camera, device=options.device), poses)
+    renderer = MeshRenderer(load_mesh(options.mesh), camera, device=options.device, max_depth=options.max_depth)
+    return RenderedSequence("mesh", renderer, poses)
 
 
 def main(arguments: list[str] | None = None) -> int:

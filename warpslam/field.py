@@ -261,18 +261,18 @@ class RayBatch:
         rays_per_frame: int,
         camera: Intrinsics,
         *,
-        edge_u: int = 0,
-        edge_v: int = 0,
+        edges: tuple[int, int] = (0, 0),
         active: tuple[float, tuple[int, int], wp.array] | None = None,
     ) -> None:
         """Draw random pixels of the window's images (colour, depth, depth scale; see `warpslam.keyframes.ImagePool`).
 
+        edges: Columns and rows that are left out on both sides [px].
         active: Share of pixels that is not uniform, but follows the error of an image's cells; the number of cells
             across and down; and running sums of the error, (frames, cells). See `warpslam.active_sampling`.
         """
         self.count = window.shape[0] * rays_per_frame
         rgb, depth, scale = images
-        inputs = [self.seeds, self.iteration, rays_per_frame, window, edge_u, edge_v, *_camera_vectors(camera)]
+        inputs = [self.seeds, self.iteration, rays_per_frame, window, *edges, *_camera_vectors(camera)]
         share, cells, cumulative_error = active or (0.0, (1, 1), self._no_errors)
         inputs += [rgb, depth, scale, share, wp.vec2i(*cells), cumulative_error]
         inputs += [self.frame, self.direction_camera, self.measured_depth, self.measured_rgb]

@@ -152,8 +152,8 @@ class Tracker:
         self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, tape: wp.Tape | None = None
     ) -> None:
         config, sampling = self.config, self.sampling
-        edges = {"edge_u": config.ignore_edge_u, "edge_v": config.ignore_edge_v}
-        batch.draw(images.arrays, self._window, batch.capacity, self.camera, **edges)
+        edges = (config.ignore_edge_u, config.ignore_edge_v)
+        batch.draw(images.arrays, self._window, batch.capacity, self.camera, edges=edges)
         batch.cast(self._poses.poses, differentiate=tape is not None)
         batch.bound(arrays)
         batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)

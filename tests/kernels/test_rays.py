@@ -46,7 +46,7 @@ def draw(images, device, scene_map, *, jitter: bool, seed: int = 5) -> RayBatch:
     window = wp.array([0, 1], dtype=int, device=device)
     poses = wp.array(np.stack([vector_from_pose(np.eye(4))] * 2), dtype=float, device=device, requires_grad=True)
     batch.set_seeds([seed])
-    batch.draw(images[0].arrays, window, RAYS // 2, CAMERA, edge_u=3, edge_v=2)
+    batch.draw(images[0].arrays, window, RAYS // 2, CAMERA, edges=(3, 2))
     batch.cast(poses)
     batch.bound(scene_map.arrays())
     batch.place_samples(32, 16, jitter=jitter)

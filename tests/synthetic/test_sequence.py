@@ -185,6 +185,15 @@ def test_mesh_tool(tmp_path):
     poses = np.loadtxt(tmp_path / "out/traj.txt").reshape(-1, 4, 4)
     assert steps(poses)[0] == pytest.approx(0.013, abs=0.003)
     np.testing.assert_allclose(np.linalg.norm(poses[:, :2, 3] - [0.5, 0], axis=1), 1.5)
+    command[-1] = str(tmp_path / "walk")
+    through = ["--through=-1,0 1,0", "--max-depth", "2.5", "--mesh", str(mesh)]
+    done = subprocess.run([*command, *through], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    poses = np.loadtxt(tmp_path / "walk/traj.txt").reshape(-1, 4, 4)
+    np.testing.assert_allclose(poses[:, :3, 3], [[-1, 0, 0.2], [0, 0, 0.2], [1, 0, 0.2]], atol=1e-6)
+    # The wall straight ahead is 4, 3 and 2 m away.
+    centre = [np.asarray(Image.open(tmp_path / f"walk/results/depth{n:06d}.png"))[8, 16] / 6553.5 for n in range(3)]
+    assert centre[:2] == [0.0, 0.0] and centre[2] == pytest.approx(2.0, abs=0.1)
     failed = subprocess.run([*command, "--mesh", str(tmp_path / "none.obj")], capture_output=True, text=True)
     assert failed.returncode == 1 and "none.obj" in failed.stderr
 

@@ -183,8 +183,8 @@ class Imap(Baseline):
 
     def _tracking_loss(self, wanted: Wanted | None = None, tape: wp.Tape | None = None) -> None:
         config, batch, bound = self.config.tracking, self._tracking, self._bound
-        edges = {"edge_u": config.ignore_edge_u, "edge_v": config.ignore_edge_v}
-        batch.draw(self._images.arrays, self._slot_of_frame, batch.capacity, self.intrinsics, **edges)
+        edges = (config.ignore_edge_u, config.ignore_edge_v)
+        batch.draw(self._images.arrays, self._slot_of_frame, batch.capacity, self.intrinsics, edges=edges)
         batch.cast(self._poses.poses, differentiate=tape is not None)
         batch.bound_to(bound.low, bound.high)
         batch.evaluate(self.network, bound, wanted, tape, jitter=self.config.sampling.jitter)
