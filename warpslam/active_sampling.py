@@ -14,6 +14,7 @@ from warpslam.config import SamplingConfig
 from warpslam.field import EXACT, FieldArrays, RayBatch
 from warpslam.kernels import rays
 from warpslam.launching import Launcher
+from warpslam.profiling import phase
 
 CELLS = (20, 15)
 """Cells of an image, across and down."""
@@ -33,6 +34,7 @@ class CellErrors:
         self._batch = RayBatch(capacity * self.cell_count, sampling.stratified + sampling.surface, device, launcher)
         self.cumulative = wp.zeros((capacity, self.cell_count), dtype=float, device=device)
 
+    @phase("active sampling")
     def measure(
         self,
         arrays: FieldArrays,
