@@ -23,7 +23,8 @@ from warpslam.synthetic import SyntheticSequence
 SETTINGS = ("tracking.optimizer=adam", "mapping.first_iterations=12", "mapping.iterations=6")
 KERNELS = {
     "fill_grid", "project_vertices", "select_vertices", "clear_moments", "draw_pixels", "cast_rays", "bound_rays",
-    "probe_pixels", "accumulate_errors", "place_samples", "start_rays", "coarse_forward", "coarse_backward", "middle_forward", "fine_forward",
+    "probe_pixels", "accumulate_errors", "place_samples",
+    "start_rays", "coarse_forward", "coarse_backward", "middle_forward", "fine_forward",
     "color_forward", "geometry_backward", "color_backward", "composite", "composite_color", "ray_variance",
     "list_weighty", "list_steep", "composite_backward", "collect_ray_gradients", "mapping_loss",
     "mapping_loss (adjoint)", "tracking_loss",
