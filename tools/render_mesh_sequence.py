@@ -72,21 +72,17 @@ def make_sequence(options: argparse.Namespace) -> RenderedSequence:
     intrinsics = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
     if options.through is not None:
         poses = walk(options.through, options.frames, eye_height=options.eye_height)
-        return _rendered(options, intrinsics, poses)
-    poses = orbit(
-        np.array([*options.room, options.eye_height]),
-        (options.radius, options.radius),
-        options.frames,
-        turn=options.step / options.radius,
-        start=np.radians(options.start),
-        aim=options.target_height,
-        phase=np.random.default_rng(options.seed).uniform(0, 2 * np.pi),
-    )
-    return _rendered(options, intrinsics, poses)
-
-
-def _rendered(options: argparse.Namespace, camera: Intrinsics, poses: np.ndarray) -> RenderedSequence:
-    renderer = MeshRenderer(load_mesh(options.mesh), camera, device=options.device, max_depth=options.max_depth)
+    else:
+        poses = orbit(
+            np.array([*options.room, options.eye_height]),
+            (options.radius, options.radius),
+            options.frames,
+            turn=options.step / options.radius,
+            start=np.radians(options.start),
+            aim=options.target_height,
+            phase=np.random.default_rng(options.seed).uniform(0, 2 * np.pi),
+        )
+    renderer = MeshRenderer(load_mesh(options.mesh), intrinsics, device=options.device, max_depth=options.max_depth)
     return RenderedSequence("mesh", renderer, poses)
 
 

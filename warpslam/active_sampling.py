@@ -11,7 +11,7 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.config import SamplingConfig
-from warpslam.field import EXACT, FieldArrays, RayBatch
+from warpslam.field import EXACT, FieldArrays, RayBatch, camera_vectors
 from warpslam.kernels import rays
 from warpslam.launching import Launcher
 from warpslam.profiling import phase
@@ -26,13 +26,17 @@ class CellErrors:
     """How much the map errs in depth in each cell of some images, from one random pixel a cell.
 
     cumulative: Running sums over the cells of an image, row by row, float (frames, cells).
+    active: What `RayBatch.draw` takes, for a ``share`` of the rays.
     """
 
-    def __init__(self, capacity: int, sampling: SamplingConfig, device: wp.Device, launcher: Launcher) -> None:
+    def __init__(
+        self, capacity: int, share: float, sampling: SamplingConfig, device: wp.Device, launcher: Launcher
+    ) -> None:
         self.cell_count = CELLS[0] * CELLS[1]
         self.sampling, self._launcher = sampling, launcher
         self._batch = RayBatch(capacity * self.cell_count, sampling.stratified + sampling.surface, device, launcher)
         self.cumulative = wp.zeros((capacity, self.cell_count), dtype=float, device=device)
+        self.active = share, CELLS, self.cumulative
 
     @phase("active sampling")
     def measure(
@@ -50,8 +54,7 @@ class CellErrors:
         batch.set_seeds([seed])
         batch.count = frames * self.cell_count
         _, depth, scale = images
-        focal, center = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
-        inputs = [batch.seeds, batch.iteration, window, wp.vec2i(*CELLS), focal, center, depth, scale]
+        inputs = [batch.seeds, batch.iteration, window, wp.vec2i(*CELLS), *camera_vectors(camera), depth, scale]
         inputs += [batch.frame, batch.direction_camera, batch.measured_depth]
         self._launcher.launch(rays.probe_pixels, batch.count, inputs)
         batch.cast(poses, differentiate=False)

@@ -19,6 +19,7 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.decoders import BLOCK_COUNT, EMBEDDING_SIZE, FEATURE_SIZE, SKIP_BLOCK, DecoderWeights
+from warpslam.field import camera_vectors
 from warpslam.kernels import frustum
 from warpslam.kernels.grid import Vec32
 from warpslam.profiling import phase
@@ -60,8 +61,7 @@ class DepthStart:
             selected: Only vertices that are 1 here change, uint8 (rows,).
         """
         T_camera_world = wp.mat44(np.linalg.inv(T_world_camera).astype(np.float32))
-        focal, center = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
-        inputs = [grid.lattice, T_camera_world, focal, center, depth, selected]
+        inputs = [grid.lattice, T_camera_world, *camera_vectors(camera), depth, selected]
         inputs += [Vec32(*self.base), Vec32(*self.slope), TRUNCATION * grid.spacing, REACH * grid.spacing]
         wp.launch(
             frustum.start_from_depth,

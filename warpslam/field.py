@@ -272,7 +272,7 @@ class RayBatch:
         """
         self.count = window.shape[0] * rays_per_frame
         rgb, depth, scale = images
-        inputs = [self.seeds, self.iteration, rays_per_frame, window, *edges, *_camera_vectors(camera)]
+        inputs = [self.seeds, self.iteration, rays_per_frame, window, *edges, *camera_vectors(camera)]
         share, cells, cumulative_error = active or (0.0, (1, 1), self._no_errors)
         inputs += [rgb, depth, scale, share, wp.vec2i(*cells), cumulative_error]
         inputs += [self.frame, self.direction_camera, self.measured_depth, self.measured_rgb]
@@ -282,7 +282,7 @@ class RayBatch:
         """All pixels of ``row_count`` rows of an image that takes every ``stride``-th pixel."""
         width = -(-camera.width // stride)
         self.count = row_count * width
-        inputs = [first_row, width, stride, *_camera_vectors(camera), self.frame, self.direction_camera]
+        inputs = [first_row, width, stride, *camera_vectors(camera), self.frame, self.direction_camera]
         self.launcher.launch(rays.grid_pixels, self.count, inputs)
 
     def set_points(self, points: np.ndarray) -> None:
@@ -439,7 +439,7 @@ class RayBatch:
             if self.kernels.sums_weights_apart:
                 self._layer_grad = wp.empty((size, 14), dtype=Vec32, device=self.device)
             else:
-                shape = (decoder.GROUP_SIZE * slice_count(self.device), decoder.GROUP_COLUMNS)
+                shape = (decoder.WEIGHT_GROUP * slice_count(self.device), decoder.WEIGHT_GROUP_COLUMNS)
                 self._layer_inputs = wp.zeros((*shape, 32), dtype=float, device=self.device)
                 pointer = self._layer_inputs.ptr
                 self._layer_grad = wp.array(ptr=pointer, dtype=Vec32, shape=shape, device=self.device)
@@ -605,5 +605,6 @@ def gradient_buffers(row_count: int, device: wp.Device) -> wp.array:
     return wp.zeros((slice_count(device), row_count), dtype=Vec32, device=device)
 
 
-def _camera_vectors(camera: Intrinsics) -> list:
+def camera_vectors(camera: Intrinsics) -> list[wp.vec2]:
+    """Focal lengths and principal point [px], as the kernels take them."""
     return [wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)]

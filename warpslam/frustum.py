@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics
+from warpslam.field import camera_vectors
 from warpslam.kernels import frustum
 from warpslam.kernels.grid import Lattice
 from warpslam.profiling import phase
@@ -39,7 +40,7 @@ def select_in_frustum(
     wp.launch(
         frustum.project_vertices,
         dim=shape,
-        inputs=[lattice, T_camera_world, wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy), depth],
+        inputs=[lattice, T_camera_world, *camera_vectors(camera), depth],
         outputs=[looked_up, vertex_depth, max_depth],
         device=device,
         record_tape=False,

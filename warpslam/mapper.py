@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from warpslam.active_sampling import CELLS, CellErrors
+from warpslam.active_sampling import CellErrors
 from warpslam.camera import Intrinsics, pose_from_vector, vector_from_pose
 from warpslam.config import MappingConfig, SamplingConfig
 from warpslam.depth_start import DepthStart
@@ -73,13 +73,15 @@ class Mapper:
         self._launcher = Launcher(device)
         self._grids = {level: GridOptimizer(self._launcher) for level in LEVELS}
         self._decoder = ColorDecoderOptimizer(self._launcher)
-        self._poses = PoseOptimizer(2 * config.window + 2, self._launcher)
+        # Refinement doubles the window; the last keyframe and the current frame come on top.
+        frame_count = 2 * config.window + 2
+        self._poses = PoseOptimizer(frame_count, self._launcher)
         samples = sampling.stratified + sampling.surface
         self._batch = RayBatch(config.pixels, samples, device, self._launcher)
         self._losses = wp.zeros(len(STAGES), dtype=float, device=device)
         self._errors: CellErrors | None = None
         if config.active_share > 0:
-            self._errors = CellErrors(2 * config.window + 2, sampling, device, self._launcher)
+            self._errors = CellErrors(frame_count, config.active_share, sampling, device, self._launcher)
         self._changed: set[str] = set()
         self._depth_start: DepthStart | None = None
         if config.depth_start and config.optimize_middle:
@@ -274,10 +276,8 @@ class Mapper:
             color_weights=self._decoder.gradient if train_decoder else None,
         )
         sampling = self.sampling
+        active = self._errors.active if self._errors is not None else None
         with self._launcher.tape() as tape:
-            active = None
-            if self._errors is not None:
-                active = config.active_share, CELLS, self._errors.cumulative
             batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera, active=active)
             batch.cast(self._poses.poses, differentiate=gradients.points)
             batch.bound(arrays)

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.kernels.drawn_pixels import pixels_of
 from warpslam.active_sampling import CELLS, LARGEST_ERROR, CellErrors
 from warpslam.camera import Intrinsics, vector_from_pose
 from warpslam.config import GridConfig, SamplingConfig
 from warpslam.decoders import load_decoders
 from warpslam.field import RayBatch
+from warpslam.kernels import rays
 from warpslam.keyframes import ImagePool
 from warpslam.launching import Launcher
 from warpslam.scene import SceneMap
@@ -18,14 +20,6 @@ from warpslam.scene import SceneMap
 CAMERA = Intrinsics(80.0, 80.0, 79.5, 59.5, 160, 120)
 CELL_COUNT = CELLS[0] * CELLS[1]
 RAYS = 6000
-
-
-def pixels(batch: RayBatch) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows of the rays."""
-    direction = batch.direction_camera.numpy()[: batch.count]
-    u = np.rint(direction[:, 0] * CAMERA.fx + CAMERA.cx).astype(int)
-    v = np.rint(direction[:, 1] * CAMERA.fy + CAMERA.cy).astype(int)
-    return u, v
 
 
 def cells(u: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -59,7 +53,7 @@ def test_rays_follow_the_error_of_their_own_image(images, device):
     error[0, 17], error[0, 250] = 3.0, 1.0
     error[1, CELL_COUNT - 1] = 0.2
     batch = drawn(images, device, 1.0, error)
-    where, frame = cells(*pixels(batch)), batch.frame.numpy()
+    where, frame = cells(*pixels_of(batch, CAMERA)), batch.frame.numpy()
     counts = [np.bincount(where[frame == f], minlength=CELL_COUNT) for f in range(2)]
     assert set(np.flatnonzero(counts[0])) == {17, 250} and set(np.flatnonzero(counts[1])) == {CELL_COUNT - 1}
     # Three standard deviations of a binomial share of 3/4 of 6000.
@@ -70,7 +64,7 @@ def test_rays_fall_anywhere_in_their_cell(images, device):
     """Every pixel of a chosen cell is drawn."""
     error = np.zeros((2, CELL_COUNT))
     error[:, 42] = 1.0
-    u, v = pixels(drawn(images, device, 1.0, error))
+    u, v = pixels_of(drawn(images, device, 1.0, error), CAMERA)
     width, height = CAMERA.width // CELLS[0], CAMERA.height // CELLS[1]
     assert len(set(zip(u, v, strict=True))) == width * height
 
@@ -79,10 +73,10 @@ def test_the_share_of_active_rays(images, device):
     """The others are uniform."""
     error = np.zeros((2, CELL_COUNT))
     error[:, 5] = 1.0
-    where = cells(*pixels(drawn(images, device, 0.4, error)))
+    where = cells(*pixels_of(drawn(images, device, 0.4, error), CAMERA))
     assert np.mean(where == 5) == pytest.approx(0.4 + 0.6 / CELL_COUNT, abs=0.014)
     assert len(set(where)) > 0.95 * CELL_COUNT
-    where = cells(*pixels(drawn(images, device, 0.0, error)))
+    where = cells(*pixels_of(drawn(images, device, 0.0, error), CAMERA))
     assert np.mean(where == 5) < 0.01
 
 
@@ -93,7 +87,7 @@ def test_errors_of_the_map(images, device):
     rgb, depth = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8), images.depth_image(1)
     depth[:, : CAMERA.width // 2] = 0.0
     half = images.bring([images.add(rgb, depth)])[0]
-    errors = CellErrors(2, SamplingConfig(), device, Launcher(device))
+    errors = CellErrors(2, 0.5, SamplingConfig(), device, Launcher(device))
     poses = wp.array(np.stack([vector_from_pose(np.eye(4))] * 2).astype(np.float32), dtype=float, device=device)
     window = wp.array([half, 0], dtype=int, device=device)
     errors.measure(scene.arrays(), images.arrays, window, poses, CAMERA, seed=9)
@@ -107,8 +101,6 @@ def test_errors_of_the_map(images, device):
 
 def test_without_any_error_all_cells_are_alike(device):
     """A perfect map leaves no division by nothing."""
-    from warpslam.kernels import rays
-
     depth = wp.full(2 * CELL_COUNT, 1.0, dtype=float, device=device)
     keep = wp.full(2 * CELL_COUNT, 1, dtype=int, device=device)
     cumulative = wp.zeros((2, CELL_COUNT), dtype=float, device=device)

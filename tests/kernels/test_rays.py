@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from tests.kernels.drawn_pixels import pixels_of
 from warpslam.camera import Intrinsics, vector_from_pose
 from warpslam.config import GridConfig
 from warpslam.decoders import load_decoders
@@ -56,9 +57,7 @@ def draw(images, device, scene_map, *, jitter: bool, seed: int = 5) -> RayBatch:
 def test_pixels_carry_the_images_values(images, device, scene_map):
     """Depth and colour of a ray are those of its pixel; the border is left out; both frames get their share."""
     batch = draw(images, device, scene_map, jitter=False)
-    direction = batch.direction_camera.numpy()
-    u = np.rint(direction[:, 0] * CAMERA.fx + CAMERA.cx).astype(int)
-    v = np.rint(direction[:, 1] * CAMERA.fy + CAMERA.cy).astype(int)
+    u, v = pixels_of(batch, CAMERA)
     assert u.min() >= 3 and u.max() < 61 and v.min() >= 2 and v.max() < 46
     frame = batch.frame.numpy()
     assert (np.bincount(frame) == RAYS // 2).all()
