@@ -53,3 +53,27 @@ def test_no_iteration_is_spent_on_a_frozen_middle_level():
 
     assert stages() == ["middle"] * 5 + ["fine"] * 2 + ["color"] * 3
     assert stages("mapping.optimize_middle=false") == ["fine"] * 7 + ["color"] * 3
+
+
+def test_what_has_moved_away_leaves_the_map():
+    """A box in front of a wall is gone after three keyframes: those still show it, and hold it in the map unless their
+    rays to it are left out.
+    """
+    box = np.s_[20:40, 30:50]
+    wall = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32)
+    with_box = wall.copy()
+    with_box[box] = 1.2
+    rgb = np.full((*wall.shape, 3), 128, np.uint8)
+
+    def error(*overrides: str) -> float:
+        """Mean error of the depth where the box was [m]."""
+        settings = [
+            "mapping.every=1", "mapping.first_iterations=60", "mapping.iterations=25", "mapping.pixels=300",
+            "keyframes.every=1", "mapping.coarse=false", "tracking.use_given_poses=true",
+        ]  # fmt: skip
+        slam = Slam(CAMERA, Config.from_preset("default", [*settings, *overrides]), "cpu")
+        for n, depth in enumerate([with_box] * 3 + [wall] * 3):
+            slam.step(rgb, depth, float(n), np.eye(4))
+        return float(np.abs(slam.render(np.eye(4)).depth - wall)[box].mean())
+
+    assert error("mapping.moved_margin=0.1") < 0.5 * error()

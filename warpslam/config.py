@@ -139,6 +139,12 @@ class MappingConfig(_Group):
     color_weight: float = Field(0.2, ge=0, description="lambda_p of Eq. 10")
     loss: Literal["sum", "mean"] = Field("sum", description="sums over rays (released code) or means (Eq. 8-9)")
     train_color_decoder: bool = Field(True, description="the colour decoder is optimised with the map")
+    moved_margin: float = Field(
+        0.0,
+        ge=0,
+        description="rays of keyframes that the current depth contradicts by this much are left out, for something has "
+        "moved [m]; 0 = off (paper)",
+    )
     depth_start: bool = Field(
         False,
         description="middle features that are seen for the first time start from the measured depth, not as noise: "
@@ -362,7 +368,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "apartment": {},
     "own": {},
     "seven_scenes": {},
-    "cofusion": {"mapping": {"bundle_adjustment_rate": 0.0}},
+    "cofusion": {"mapping": {"bundle_adjustment_rate": 0.0, "moved_margin": 0.1}},
     "icl": {"mapping": {"every": 2}},
     "tum_rgbd": {"grid": _TUM_GRID},
     "paper_replica": _paper({"pixels": 200, "iterations": 10, "ignore_edge_u": 100, "ignore_edge_v": 100}),

@@ -312,6 +312,25 @@ class RayBatch:
         inputs = [low, high, self.origin, self.direction, self.measured_depth, int(use_depth)]
         self.launcher.launch(rays.bound_rays, self.count, [*inputs, self.t_exit, self.keep, self.max_depth])
 
+    def drop_contradicted(
+        self,
+        images: tuple[wp.array, wp.array, wp.array],
+        current: int,
+        T_camera_world: np.ndarray,
+        camera: Intrinsics,
+        margin: float,
+    ) -> None:
+        """After `bound`: leave out the rays of other frames that the current one contradicts, for something has moved.
+
+        current: Its place in the window; its image is in slot 0.
+        T_camera_world: Its pose, inverted (4, 4).
+        margin: By how much [m].
+        """
+        _, depth, scale = images
+        inputs = [current, margin, 0.5 * margin, wp.mat44(T_camera_world.astype(np.float32))]
+        inputs += [*camera_vectors(camera), depth, scale, self.frame, self.origin, self.direction]
+        self.launcher.launch(rays.drop_contradicted, self.count, [*inputs, self.measured_depth, self.keep])
+
     def place_samples(self, stratified: int, surface: int, *, use_depth: bool = True, jitter: bool = False) -> None:
         """Depths of the samples along each kept ray, ascending."""
         self.sample_count = stratified + (surface if use_depth else 0)

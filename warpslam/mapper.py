@@ -83,6 +83,7 @@ class Mapper:
         if config.active_share > 0:
             self._errors = CellErrors(frame_count, config.active_share, sampling, device, self._launcher)
         self._changed: set[str] = set()
+        self._T_camera_world = np.eye(4)
         self._depth_start: DepthStart | None = None
         if config.depth_start and config.optimize_middle:
             self._depth_start = DepthStart(scene.decoder_weights.middle, scene.grids["middle"].spacing)
@@ -172,6 +173,7 @@ class Mapper:
         self._select(images, vector, everything=refinement)
         ray_counts: dict[str, int] = {}
         self._launcher.forget()
+        self._T_camera_world = np.linalg.inv(pose_from_vector(vector))
 
         if config.coarse and not refinement:
             coarse_slots = wp.array([*in_use[len(window) :], 0], dtype=int, device=self.device)
@@ -281,6 +283,10 @@ class Mapper:
             batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera, active=active)
             batch.cast(self._poses.poses, differentiate=gradients.points)
             batch.bound(arrays)
+            current = slots.shape[0] - 1
+            if config.moved_margin > 0 and current > 0:
+                inverse = self._T_camera_world
+                batch.drop_contradicted(images.arrays, current, inverse, self.camera, config.moved_margin)
             batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)
             scale = 1.0 / batch.count if config.loss == "mean" else 1.0
             thresholds = Thresholds(sampling.min_weight, sampling.min_gradient * scale, sampling.min_transmittance)

@@ -40,6 +40,7 @@ from warpslam.kernels.grid import (
     interpolate,
     interpolate_adjoint_features,
     interpolate_adjoint_point,
+    sum32,
 )
 
 # Rows of the packed weights of a decoder with coordinates (warpslam.field packs them).
@@ -395,21 +396,22 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         trips: int,
     ):
         """Through the lookup and through the embedding."""
-        d = Positions()
-        for p in range(size):
-            x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
-            d[p] = interpolate_adjoint_point(features, lattice, find_cell(lattice, x), dc[p])
+        # Products are summed over the chunks before they are summed over the channels, which is slow.
+        along_x = Block()
+        along_y = Block()
+        along_z = Block()
         for chunk in range(3):
             da = angle_adjoint(positions, W, T, chunk, a0, a3, trips)
             for p in range(size):
-                d[p] += wp.vec3(
-                    dot32(da[p], W[B + 3 * chunk]),
-                    dot32(da[p], W[B + 3 * chunk + 1]),
-                    dot32(da[p], W[B + 3 * chunk + 2]),
-                )
+                along_x[p] += wp.cw_mul(da[p], W[B + 3 * chunk])
+                along_y[p] += wp.cw_mul(da[p], W[B + 3 * chunk + 1])
+                along_z[p] += wp.cw_mul(da[p], W[B + 3 * chunk + 2])
         for p in range(size):
             if wanted[p] != 0:
-                point_grad[samples[p]] = point_grad[samples[p]] + wp.vec3(d[p, 0], d[p, 1], d[p, 2])
+                x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
+                through_lookup = interpolate_adjoint_point(features, lattice, find_cell(lattice, x), dc[p])
+                through_embedding = wp.vec3(sum32(along_x[p]), sum32(along_y[p]), sum32(along_z[p]))
+                point_grad[samples[p]] = point_grad[samples[p]] + through_lookup + through_embedding
 
     # -- middle and fine -------------------------------------------------------------------------------------------
 

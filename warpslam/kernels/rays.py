@@ -131,6 +131,71 @@ def probe_pixels(
     depth[tid] = float(depth_images[slot, pixel[1], pixel[0]]) * depth_scales[slot]
 
 
+@wp.func
+def nearest_and_farthest(
+    image: wp.array(dtype=wp.uint16, ndim=3), slot: int, scale: float, u: int, v: int
+) -> wp.vec2:
+    """Least and largest depth of a pixel and its eight neighbours; (0, 0) if one of them is missing or outside."""
+    least = float(1.0e30)
+    largest = float(0.0)
+    for dv in range(-1, 2):
+        for du in range(-1, 2):
+            x = u + du
+            y = v + dv
+            if x < 0 or x >= image.shape[2] or y < 0 or y >= image.shape[1]:
+                return wp.vec2(0.0, 0.0)
+            depth = float(image[slot, y, x]) * scale
+            if depth <= 0.0:
+                return wp.vec2(0.0, 0.0)
+            least = wp.min(least, depth)
+            largest = wp.max(largest, depth)
+    return wp.vec2(least, largest)
+
+
+@wp.kernel(enable_backward=False)
+def drop_contradicted(
+    current: int,
+    margin: float,
+    step: float,
+    T_camera_world: wp.mat44,
+    focal: wp.vec2,
+    center: wp.vec2,
+    depth_images: wp.array(dtype=wp.uint16, ndim=3),
+    depth_scales: wp.array(dtype=float),
+    frame: wp.array(dtype=int),
+    origin: wp.array(dtype=wp.vec3),
+    direction: wp.array(dtype=wp.vec3),
+    depth: wp.array(dtype=float),
+    keep: wp.array(dtype=int),
+):
+    """Leave out the rays of earlier frames that the current depth image, in slot 0, contradicts by ``margin``: it sees
+    through the point they measured, or measures a surface that they pass through.
+
+    Every ``step`` along a ray is looked at. A pixel speaks for itself and its neighbours only, so that outlines, where
+    a little shift of the camera changes everything, contradict nothing.
+    """
+    tid = wp.tid()
+    if keep[tid] == 0 or frame[tid] == current or depth[tid] <= 0.0:
+        return
+    d = direction[tid]
+    count = int(depth[tid] / step) + 1
+    for n in range(count):
+        # The last one is the point that was measured.
+        z = depth[tid] * float(n + 1) / float(count)
+        q = wp.transform_point(T_camera_world, origin[tid] + z * d)
+        if q[2] > 0.0:
+            u = int(wp.rint(focal[0] * q[0] / q[2] + center[0]))
+            v = int(wp.rint(focal[1] * q[1] / q[2] + center[1]))
+            seen = nearest_and_farthest(depth_images, 0, depth_scales[0], u, v)
+            if seen[0] > 0.0:
+                if n + 1 == count:
+                    if q[2] < seen[0] - margin:
+                        keep[tid] = 0
+                elif z < depth[tid] - margin:
+                    if q[2] > seen[1] + 0.5 * margin and q[2] < seen[0] + 1.5 * margin:
+                        keep[tid] = 0
+
+
 @wp.kernel(enable_backward=False)
 def accumulate_errors(
     cell_count: int,
