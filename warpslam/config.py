@@ -186,7 +186,9 @@ class MeshingConfig(_Group):
 
     voxel: float = Field(0.02, gt=0, description="edge of a marching-cubes cell [m]")
     level_set: float = Field(
-        -0.1, description="logit of the surface; 0 (occupancy 1/2, the paper) loses what was mapped for a short time"
+        -0.1,
+        description="logit of the surface; 0 (occupancy 1/2, the paper) is more accurate where the map is well formed, "
+        "and loses what was mapped for a short time",
     )
     min_component_area: float = Field(
         0.2, ge=0, description="smaller loose pieces are dropped [m^2], unless measured depth confirms them"
@@ -354,6 +356,7 @@ def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, A
         "tracking": {**_PAPER, **(tracking or {})},
         "mapping": mapping,
         "keyframes": {"every": 50},
+        "meshing": {"level_set": 0.0},
         **groups,
     }
 
