@@ -396,22 +396,29 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         trips: int,
     ):
         """Through the lookup and through the embedding."""
-        # Products are summed over the chunks before they are summed over the channels, which is slow.
+        d = Positions()
+        for p in range(size):
+            x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
+            d[p] = interpolate_adjoint_point(features, lattice, find_cell(lattice, x), dc[p])
+        # Sums over the channels are slow on the CPU: there the chunks are added first. On CUDA registers are scarce.
         along_x = Block()
         along_y = Block()
         along_z = Block()
         for chunk in range(3):
             da = angle_adjoint(positions, W, T, chunk, a0, a3, trips)
+            row = B + 3 * chunk
             for p in range(size):
-                along_x[p] += wp.cw_mul(da[p], W[B + 3 * chunk])
-                along_y[p] += wp.cw_mul(da[p], W[B + 3 * chunk + 1])
-                along_z[p] += wp.cw_mul(da[p], W[B + 3 * chunk + 2])
+                if wp.static(on_cpu):
+                    along_x[p] += wp.cw_mul(da[p], W[row])
+                    along_y[p] += wp.cw_mul(da[p], W[row + 1])
+                    along_z[p] += wp.cw_mul(da[p], W[row + 2])
+                else:
+                    d[p] += wp.vec3(dot32(da[p], W[row]), dot32(da[p], W[row + 1]), dot32(da[p], W[row + 2]))
         for p in range(size):
+            if wp.static(on_cpu):
+                d[p] += wp.vec3(sum32(along_x[p]), sum32(along_y[p]), sum32(along_z[p]))
             if wanted[p] != 0:
-                x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
-                through_lookup = interpolate_adjoint_point(features, lattice, find_cell(lattice, x), dc[p])
-                through_embedding = wp.vec3(sum32(along_x[p]), sum32(along_y[p]), sum32(along_z[p]))
-                point_grad[samples[p]] = point_grad[samples[p]] + through_lookup + through_embedding
+                point_grad[samples[p]] = point_grad[samples[p]] + wp.vec3(d[p, 0], d[p, 1], d[p, 2])
 
     # -- middle and fine -------------------------------------------------------------------------------------------
 
