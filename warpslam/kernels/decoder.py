@@ -279,16 +279,22 @@ def decoder_kernels(target: str) -> SimpleNamespace:
     ):
         """grad[row + k] += sum over a slice's group of x[k] d, both columns of what its samples stored."""
         first = WEIGHT_GROUP * slot
-        # Two rows at a time share what is read of d.
-        for k in range(16):
-            even = Vec32()
-            odd = Vec32()
+        # Four rows at a time share what is read of d.
+        for k in range(8):
+            r0 = Vec32()
+            r1 = Vec32()
+            r2 = Vec32()
+            r3 = Vec32()
             for q in range(WEIGHT_GROUP):
                 g = layer_grad[first + q, d]
-                even += inputs[first + q, x, 2 * k] * g
-                odd += inputs[first + q, x, 2 * k + 1] * g
-            grad[slot, row + 2 * k] = grad[slot, row + 2 * k] + even
-            grad[slot, row + 2 * k + 1] = grad[slot, row + 2 * k + 1] + odd
+                r0 += inputs[first + q, x, 4 * k] * g
+                r1 += inputs[first + q, x, 4 * k + 1] * g
+                r2 += inputs[first + q, x, 4 * k + 2] * g
+                r3 += inputs[first + q, x, 4 * k + 3] * g
+            grad[slot, row + 4 * k] = grad[slot, row + 4 * k] + r0
+            grad[slot, row + 4 * k + 1] = grad[slot, row + 4 * k + 1] + r1
+            grad[slot, row + 4 * k + 2] = grad[slot, row + 4 * k + 2] + r2
+            grad[slot, row + 4 * k + 3] = grad[slot, row + 4 * k + 3] + r3
 
     @func
     def add_sum(grad: wp.array2d(dtype=Vec32), slot: int, row: int, d: Block):
