@@ -26,7 +26,6 @@ from warpslam.kernels.decoder import COLOR_WEIGHT_ROWS
 from warpslam.launching import Launcher
 from warpslam.synthetic import SyntheticSequence
 
-RAYS, STRATIFIED, SURFACE = 1000, 32, 16
 LEVELS = ("middle", "fine", "color")
 
 
@@ -72,18 +71,19 @@ def whole_grid(ours: Ours, level: str) -> GridGradient:
 def iterate(ours: Ours, gradients: Gradients, count: int) -> None:
     """Iterations of the colour stage, without their optimiser."""
     slam = ours.slam
+    pixels, sampling = slam.config.mapping.pixels, slam.config.sampling
     launcher = Launcher(slam.device)
-    batch = RayBatch(RAYS, STRATIFIED + SURFACE, slam.device, launcher)
+    batch = RayBatch(pixels, sampling.stratified + sampling.surface, slam.device, launcher)
     batch.set_seeds([0])
     window = wp.zeros(1, dtype=int, device=slam.device)
     poses = wp.array(ours.vector[None], dtype=float, device=slam.device, requires_grad=True)
     arrays = slam.scene.arrays()
     for _ in range(count):
         with launcher.tape() as tape:
-            batch.draw(slam._images.arrays, window, RAYS, CAMERA)
+            batch.draw(slam._images.arrays, window, pixels, CAMERA)
             batch.cast(poses, differentiate=gradients.points)
             batch.bound(arrays)
-            batch.place_samples(STRATIFIED, SURFACE, jitter=True)
+            batch.place_samples(sampling.stratified, sampling.surface, jitter=True)
             batch.render(arrays, "color", gradients, tape)
             batch.mapping_loss(0.2)
         launcher.call(partial(tape.backward, batch.loss))

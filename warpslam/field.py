@@ -316,20 +316,21 @@ class RayBatch:
         self,
         images: tuple[wp.array, wp.array, wp.array],
         current: int,
-        T_camera_world: np.ndarray,
+        T_world_camera: np.ndarray,
         camera: Intrinsics,
         margin: float,
     ) -> None:
         """After `bound`: leave out the rays of other frames that the current one contradicts, for something has moved.
 
         current: Its place in the window; its image is in slot 0.
-        T_camera_world: Its pose, inverted (4, 4).
+        T_world_camera: Its pose (4, 4).
         margin: By how much [m].
         """
         _, depth, scale = images
-        inputs = [current, margin, 0.5 * margin, wp.mat44(T_camera_world.astype(np.float32))]
-        inputs += [*camera_vectors(camera), depth, scale, self.frame, self.origin, self.direction]
-        self.launcher.launch(rays.drop_contradicted, self.count, [*inputs, self.measured_depth, self.keep])
+        T_camera_world = wp.mat44(np.linalg.inv(T_world_camera).astype(np.float32))
+        inputs = [current, margin, T_camera_world, *camera_vectors(camera), depth, scale]
+        inputs += [self.frame, self.origin, self.direction, self.measured_depth, self.keep]
+        self.launcher.launch(rays.drop_contradicted, self.count, inputs)
 
     def place_samples(self, stratified: int, surface: int, *, use_depth: bool = True, jitter: bool = False) -> None:
         """Depths of the samples along each kept ray, ascending."""

@@ -83,7 +83,6 @@ class Mapper:
         if config.active_share > 0:
             self._errors = CellErrors(frame_count, config.active_share, sampling, device, self._launcher)
         self._changed: set[str] = set()
-        self._T_camera_world = np.eye(4)
         self._depth_start: DepthStart | None = None
         if config.depth_start and config.optimize_middle:
             self._depth_start = DepthStart(scene.decoder_weights.middle, scene.grids["middle"].spacing)
@@ -170,10 +169,10 @@ class Mapper:
         # Both windows at once: they must be on the device together.
         in_use = images.bring([keyframe.image for keyframe in (*window, *coarse)])
         slots = wp.array([*in_use[: len(window)], 0], dtype=int, device=self.device)
-        self._select(images, vector, everything=refinement)
+        T_world_camera = pose_from_vector(vector)
+        self._select(images, T_world_camera, everything=refinement)
         ray_counts: dict[str, int] = {}
         self._launcher.forget()
-        self._T_camera_world = np.linalg.inv(pose_from_vector(vector))
 
         if config.coarse and not refinement:
             coarse_slots = wp.array([*in_use[len(window) :], 0], dtype=int, device=self.device)
@@ -191,7 +190,7 @@ class Mapper:
                 self._errors.measure(self.scene.arrays(), images.arrays, slots, self._poses.poses, self.camera, seed)
 
             def iterate(stage: str = stage) -> None:
-                self._iterate(images, slots, stage, rate_factor, adjust, refinement)
+                self._iterate(images, slots, T_world_camera, stage, rate_factor, adjust, refinement)
 
             self._launcher.iterate(stage, (), iterate)
             last_of_stage = iteration + 1 == len(stages) or stages[iteration + 1] != stage
@@ -246,10 +245,9 @@ class Mapper:
         order = rng.permutation(len(candidates))[: max(size - 2, 0)]
         return [*(candidates[n] for n in order), last]
 
-    def _select(self, images: ImagePool, vector: np.ndarray, *, everything: bool) -> None:
+    def _select(self, images: ImagePool, T_world_camera: np.ndarray, *, everything: bool) -> None:
         """Which vertices of each level may change during this call."""
         depth = wp.array(images.depth_image(0), dtype=float, device=self.device)
-        T_world_camera = pose_from_vector(vector)
         for level, optimizer in self._grids.items():
             grid = self.scene.grids[level]
             if level in self._frozen:
@@ -266,9 +264,19 @@ class Mapper:
         self._decoder.begin()
 
     def _iterate(
-        self, images: ImagePool, slots: wp.array, stage: str, rate_factor: float, adjust: bool, refinement: bool
+        self,
+        images: ImagePool,
+        slots: wp.array,
+        T_world_camera: np.ndarray,
+        stage: str,
+        rate_factor: float,
+        adjust: bool,
+        refinement: bool,
     ) -> None:
-        """One iteration of a stage; nothing in it may depend on the iteration's number, because it is replayed."""
+        """One iteration of a stage; nothing in it may depend on the iteration's number, because it is replayed.
+
+        T_world_camera: Of the current frame, before bundle adjustment (4, 4).
+        """
         config, batch, arrays = self.config, self._batch, self.scene.arrays()
         color = stage == "color"
         train_decoder = color and config.train_color_decoder and not refinement
@@ -285,8 +293,7 @@ class Mapper:
             batch.bound(arrays)
             current = slots.shape[0] - 1
             if config.moved_margin > 0 and current > 0:
-                inverse = self._T_camera_world
-                batch.drop_contradicted(images.arrays, current, inverse, self.camera, config.moved_margin)
+                batch.drop_contradicted(images.arrays, current, T_world_camera, self.camera, config.moved_margin)
             batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)
             scale = 1.0 / batch.count if config.loss == "mean" else 1.0
             thresholds = Thresholds(sampling.min_weight, sampling.min_gradient * scale, sampling.min_transmittance)

@@ -11,6 +11,7 @@ centre.
 import warp as wp
 
 from warpslam.kernels.grid import Lattice, Vec32, row_of, vertex_position
+from warpslam.kernels.rays import nearest_pixel
 
 
 @wp.func
@@ -105,8 +106,9 @@ def start_from_depth(
     q = wp.transform_point(T_camera_world, p)
     if q[2] <= 0.0:
         return
-    u = int(wp.rint(focal[0] * q[0] / q[2] + center[0]))
-    v = int(wp.rint(focal[1] * q[1] / q[2] + center[1]))
+    pixel = nearest_pixel(q, focal, center)
+    u = pixel[0]
+    v = pixel[1]
     if u < 0 or u >= image.shape[1] or v < 0 or v >= image.shape[0]:
         return
     # The nearest pixel: a mean over an outline is the depth of nothing.

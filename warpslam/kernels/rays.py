@@ -37,6 +37,14 @@ def pixel_direction(u: int, v: int, focal: wp.vec2, center: wp.vec2) -> wp.vec3:
 
 
 @wp.func
+def nearest_pixel(q: wp.vec3, focal: wp.vec2, center: wp.vec2) -> wp.vec2i:
+    """The pixel that a point in front of the camera, in its coordinates, falls on; it may lie outside the image."""
+    return wp.vec2i(
+        int(wp.rint(focal[0] * q[0] / q[2] + center[0])), int(wp.rint(focal[1] * q[1] / q[2] + center[1]))
+    )
+
+
+@wp.func
 def cell_pixel(cell: int, cells: wp.vec2i, width: int, height: int, x: float, y: float) -> wp.vec2i:
     """The pixel at (x, y), each in [0, 1), of a cell; cells[0] x cells[1] of them cover the image, row by row."""
     u = (float(cell % cells[0]) + x) * float(width) / float(cells[0])
@@ -132,16 +140,16 @@ def probe_pixels(
 
 
 @wp.func
-def nearest_and_farthest(
-    image: wp.array(dtype=wp.uint16, ndim=3), slot: int, scale: float, u: int, v: int
+def least_and_largest_depth(
+    image: wp.array(dtype=wp.uint16, ndim=3), slot: int, scale: float, pixel: wp.vec2i
 ) -> wp.vec2:
-    """Least and largest depth of a pixel and its eight neighbours; (0, 0) if one of them is missing or outside."""
+    """Of a pixel and its eight neighbours; (0, 0) if one of them is missing or outside."""
     least = float(1.0e30)
     largest = float(0.0)
     for dv in range(-1, 2):
         for du in range(-1, 2):
-            x = u + du
-            y = v + dv
+            x = pixel[0] + du
+            y = pixel[1] + dv
             if x < 0 or x >= image.shape[2] or y < 0 or y >= image.shape[1]:
                 return wp.vec2(0.0, 0.0)
             depth = float(image[slot, y, x]) * scale
@@ -156,7 +164,6 @@ def nearest_and_farthest(
 def drop_contradicted(
     current: int,
     margin: float,
-    step: float,
     T_camera_world: wp.mat44,
     focal: wp.vec2,
     center: wp.vec2,
@@ -171,29 +178,24 @@ def drop_contradicted(
     """Leave out the rays of earlier frames that the current depth image, in slot 0, contradicts by ``margin``: it sees
     through the point they measured, or measures a surface that they pass through.
 
-    Every ``step`` along a ray is looked at. A pixel speaks for itself and its neighbours only, so that outlines, where
-    a little shift of the camera changes everything, contradict nothing.
+    A ray is looked at every half ``margin``. A pixel speaks only where its neighbours agree, so that outlines, where a
+    little shift of the camera changes everything, contradict nothing.
     """
     tid = wp.tid()
     if keep[tid] == 0 or frame[tid] == current or depth[tid] <= 0.0:
         return
-    d = direction[tid]
-    count = int(depth[tid] / step) + 1
+    count = int(depth[tid] / (0.5 * margin)) + 1
     for n in range(count):
         # The last one is the point that was measured.
         z = depth[tid] * float(n + 1) / float(count)
-        q = wp.transform_point(T_camera_world, origin[tid] + z * d)
+        q = wp.transform_point(T_camera_world, origin[tid] + z * direction[tid])
         if q[2] > 0.0:
-            u = int(wp.rint(focal[0] * q[0] / q[2] + center[0]))
-            v = int(wp.rint(focal[1] * q[1] / q[2] + center[1]))
-            seen = nearest_and_farthest(depth_images, 0, depth_scales[0], u, v)
-            if seen[0] > 0.0:
-                if n + 1 == count:
-                    if q[2] < seen[0] - margin:
-                        keep[tid] = 0
-                elif z < depth[tid] - margin:
-                    if q[2] > seen[1] + 0.5 * margin and q[2] < seen[0] + 1.5 * margin:
-                        keep[tid] = 0
+            seen = least_and_largest_depth(depth_images, 0, depth_scales[0], nearest_pixel(q, focal, center))
+            sees_through = n + 1 == count and q[2] < seen[0] - margin
+            is_behind = q[2] > seen[1] + 0.5 * margin and q[2] < seen[0] + 1.5 * margin
+            if seen[0] > 0.0 and (sees_through or (z < depth[tid] - margin and is_behind)):
+                keep[tid] = 0
+                return
 
 
 @wp.kernel(enable_backward=False)
