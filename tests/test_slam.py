@@ -133,6 +133,19 @@ def test_given_poses_are_taken(frames):
         slam.step(frames[3].rgb, frames[3].depth)
 
 
+def test_given_poses_start_the_map_from_depth(frames):
+    """Where poses are given, vertices start from the depth unless the settings say no; where they are not, only if the
+    settings say so.
+    """
+
+    def has_started(*overrides: str) -> bool:
+        return bool(run(frames[:1], *overrides).scene.grids["middle"].started.numpy().any())
+
+    given, off, on = "tracking.use_given_poses=true", "mapping.depth_start=false", "mapping.depth_start=true"
+    assert has_started(given) and has_started(on)
+    assert not has_started() and not has_started(given, off)
+
+
 def test_only_vertices_in_the_frustum_change(frames):
     """A mapping call leaves every vertex behind the camera as it was, to the bit."""
     slam = run(frames[:1], "mapping.coarse=false")

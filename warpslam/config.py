@@ -145,10 +145,10 @@ class MappingConfig(_Group):
         description="rays of keyframes that the current depth contradicts by this much are left out, for something has "
         "moved [m]; 0 = off (paper)",
     )
-    depth_start: bool = Field(
-        False,
-        description="middle features that are seen for the first time start from the measured depth, not as noise: "
-        "completer maps where poses are given; a tracked camera may drift with it",
+    depth_start: bool | None = Field(
+        None,
+        description="middle features that are seen for the first time start from the measured depth, not as noise "
+        "(paper): completer maps, but a tracked camera may drift with it; empty = where poses are given",
     )
     optimize_middle: bool = Field(True, description="off: middle features stay as they began, for ablations (Fig. 9)")
     optimize_fine: bool = Field(True, description="off: fine features stay as they began, for ablations (Fig. 9)")
@@ -350,7 +350,7 @@ _PAPER: dict[str, Any] = {"optimizer": "adam", "final_rate_factor": 1.0}
 
 
 def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, Any]:
-    mapping = {"first_iterations": 1500, "active_share": 0.0, **groups.pop("mapping", {})}
+    mapping = {"first_iterations": 1500, "active_share": 0.0, "depth_start": False, **groups.pop("mapping", {})}
     return {
         "sampling": {"jitter": False},
         "tracking": {**_PAPER, **(tracking or {})},

@@ -8,8 +8,8 @@ that the decoder reads s times a steepness from f(s), wherever the vertex lies. 
 is the feature of the interpolated distance: planes come out exactly, and the optimiser starts from a surface that is
 off by centimetres where the decoder or the scene is not so simple.
 
-That is for given poses. A tracked camera believes a sharp surface, and at the border of what was mapped the start is
-sharp and wrong: it may drift with its own guesses.
+That is for given poses, where it is the default. A tracked camera believes a sharp surface, and at the border of what
+was mapped the start is sharp and wrong: it may drift with its own guesses.
 """
 
 from __future__ import annotations

@@ -103,8 +103,9 @@ class Slam:
         self._localizer = Localizer(self._tracker, self.config.tracking, intrinsics)
         mapping = self.config.mapping
         if self.config.tracking.use_given_poses:
-            # What is given stays as it is.
-            mapping = mapping.model_copy(update={"bundle_adjustment": False})
+            # What is given stays as it is, and can be believed.
+            depth_start = mapping.depth_start is not False
+            mapping = mapping.model_copy(update={"bundle_adjustment": False, "depth_start": depth_start})
         self._mapper = Mapper(self.scene, intrinsics, mapping, self.config.sampling, self.device, seed)
         self._scheduler = new_scheduler(self.config.schedule, self._mapper, self._images)
         self._vectors: list[np.ndarray] = []

@@ -34,7 +34,7 @@ class TrackingResult:
 
 
 class Tracker:
-    """Optimises the pose vector of the frame in slot 0 of the image pool by Adam, 200 rays an iteration by default."""
+    """Optimises the pose of the frame in slot 0 of the image pool, with new random rays in every iteration."""
 
     def __init__(
         self, camera: Intrinsics, config: TrackingConfig, sampling: SamplingConfig, device: wp.Device, seed: int
