@@ -160,6 +160,12 @@ class MappingConfig(_Group):
     bundle_adjustment_rate: float = Field(
         1e-3, ge=0, description="learning rate of the window's poses; the paper has 0 for Co-Fusion"
     )
+    bundle_adjustment_filter: float = Field(
+        5.0,
+        ge=0,
+        description="rays whose depth error exceeds this multiple of the median do not pull on poses, for the map is "
+        "not formed there; 0 = all pull (paper)",
+    )
     bundle_adjustment_keyframes: int = Field(5, ge=2, description="keyframes needed before poses are refined")
     color_refinement: bool = Field(True, description="refine the whole map after the last frame")
     refinement_rounds: int = Field(5, ge=1, description="rounds of `iterations` in the final refinement")
@@ -350,7 +356,10 @@ _PAPER: dict[str, Any] = {"optimizer": "adam", "final_rate_factor": 1.0}
 
 
 def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, Any]:
-    mapping = {"first_iterations": 1500, "active_share": 0.0, "depth_start": False, **groups.pop("mapping", {})}
+    mapping = {
+        "first_iterations": 1500, "active_share": 0.0, "depth_start": False, "bundle_adjustment_filter": 0.0,
+        **groups.pop("mapping", {}),
+    }  # fmt: skip
     return {
         "sampling": {"jitter": False},
         "tracking": {**_PAPER, **(tracking or {})},

@@ -175,11 +175,13 @@ class Gradients:
     grids: by level.
     points: sample positions, and through them rays and poses.
     color_weights: (slices, rows) buffers of `Vec32` for the colour decoder, or None.
+    inliers_move: only those rays reach the poses that `RayBatch.choose_inliers` chooses after the rendering.
     """
 
     grids: dict[str, GridGradient] = field(default_factory=dict)
     points: bool = False
     color_weights: wp.array | None = None
+    inliers_move: bool = False
 
 
 class RayBatch:
@@ -484,7 +486,9 @@ class RayBatch:
             if stage == "color" and (gradients.points or want_weights or "color" in gradients.grids):
                 result.append(self._color_adjoint(arrays, gradients, first, stop, slot, self.point_grad))
             if gradients.points:
-                inputs = [first, samples, self.keep, self.z, self.point_grad, self.origin.grad, self.direction.grad]
+                counts = self.inlier if gradients.inliers_move else self.keep
+                inputs = [first, samples, self.keep, counts, self.z, self.point_grad]
+                inputs += [self.origin.grad, self.direction.grad]
                 result.append((rays.collect_ray_gradients, stop - first, inputs))
             return result
 
@@ -560,11 +564,16 @@ class RayBatch:
         inputs = [self.keep, self.measured_depth, self.measured_rgb, depth_weight, color_weight, self.depth, self.rgb]
         self.launcher.launch_taped(losses.mapping_loss, self.count, inputs, [self.loss])
 
-    def choose_inliers(self, filter_factor: float, *, median_includes_missing: bool = False) -> None:
-        """Normalised residuals, their median and the inliers (Sec. 3.3, dynamic objects)."""
+    def choose_inliers(
+        self, filter_factor: float, *, median_includes_missing: bool = False, normalized: bool = True
+    ) -> None:
+        """Depth residuals, normalised by the rendered standard deviation or not, their median and the inliers, whose
+        residual is below ``filter_factor`` times that (Sec. 3.3, dynamic objects).
+        """
         launch = self.launcher.launch
         self.launcher.call(self.counts.zero_)
-        inputs = [self.keep, self.measured_depth, self.depth, self.variance, int(median_includes_missing)]
+        inputs = [self.keep, self.measured_depth, self.depth, self.variance]
+        inputs += [int(median_includes_missing), int(normalized)]
         launch(losses.tracking_residuals, self.count, [*inputs, self.sigma, self.residual, self.counts])
         if filter_factor > 0.0:
             launch(losses.lower_median, self.count, [self.residual[: self.count], self.counts, self.median])

@@ -283,6 +283,7 @@ class Mapper:
         gradients = Gradients(
             grids={level: self._grids[level].wanted() for level in _STAGE_LEVELS[stage]},
             points=adjust and color,
+            inliers_move=config.bundle_adjustment_filter > 0,
             color_weights=self._decoder.gradient if train_decoder else None,
         )
         sampling = self.sampling
@@ -298,6 +299,8 @@ class Mapper:
             scale = 1.0 / batch.count if config.loss == "mean" else 1.0
             thresholds = Thresholds(sampling.min_weight, sampling.min_gradient * scale, sampling.min_transmittance)
             batch.render(arrays, stage, gradients, tape, thresholds=thresholds)
+            if gradients.points and gradients.inliers_move:
+                batch.choose_inliers(config.bundle_adjustment_filter, normalized=False)
             batch.mapping_loss(config.color_weight * scale if color else 0.0, scale)
         self._launcher.call(partial(tape.backward, batch.loss))
         rates = {

@@ -102,13 +102,18 @@ class Iteration:
         """Depth, colour and variance of the rays that are cast."""
         self.batch.render(self.arrays, self.stage, gradients, tape)
 
-    def mapping(self) -> Gradient:
-        """Mapping loss and the gradient of everything that the stage has one for."""
+    def mapping(self, *, filter_factor: float = 0.0) -> Gradient:
+        """Mapping loss and the gradient of everything that the stage has one for; with a filter only rays with a depth
+        error below that multiple of the median move the poses.
+        """
         self.poses.grad.zero_()
         gradients = self._wanted(MAPPED_LEVELS[self.stage], points=self.stage != "coarse")
+        gradients.inliers_move = filter_factor > 0
         with self.batch.launcher.tape() as tape:
             self.cast_and_sample()
             self.render(gradients, tape)
+            if gradients.inliers_move:
+                self.batch.choose_inliers(filter_factor, normalized=False)
             self.batch.mapping_loss(0.2 if self.stage == "color" else 0.0)
         tape.backward(self.batch.loss)
         rows = {level: gradient.buffers.numpy().sum(axis=0) for level, gradient in gradients.grids.items()}

@@ -116,6 +116,27 @@ def test_mapping_gradients(device, stage, seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+def test_only_fitting_rays_move_poses(device, seed):
+    """With a filter both poses have the gradient of the rays whose depth error is below that multiple of the median,
+    and feature rows that of all rays; no gradient of the others is left over for the next iteration.
+    """
+    expected = Expected(seed, "color")
+    run = Iteration(expected.field, expected.rays, "color", device)
+    gradient = run.mapping(filter_factor=0.9)
+    error = (expected.depth - expected.rendering.depth).detach().abs()
+    fits = (expected.depth > 0) & (error < 0.9 * error[expected.depth > 0].median())
+    assert 0 < fits.sum() < (expected.depth > 0).sum() / 2
+    depth_error = (expected.depth - expected.rendering.depth).abs()[fits].sum()
+    color_error = (expected.rgb - expected.rendering.rgb).abs()[fits].sum()
+    (poses,) = torch.autograd.grad(depth_error + 0.2 * color_error, expected.poses, retain_graph=True)
+    check_rows(gradient.poses, poses, "poses")
+    oracle.mapping_loss(expected.rendering, expected.depth, expected.rgb, "color").backward()
+    for level in MAPPED_LEVELS["color"]:
+        check_rows(gradient.rows[level], expected.field.grids[level].rows.grad, level)
+    assert not run.array("point_grad").any()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("filter_factor", (10.0, 0.7, 0.0), ids=lambda f: f"filter{f}")
 @pytest.mark.parametrize("median_includes_missing", (True, False), ids=("all", "valid"))
 def test_tracking_gradients(device, seed, filter_factor, median_includes_missing):

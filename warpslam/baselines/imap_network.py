@@ -242,7 +242,8 @@ class ImapBatch(RayBatch):
             inputs = [*span, samples, *points, self._d_embedding, wanted.weights]
             result.append((kernels.embedding_weights, (chunks, imap.EMBEDDING_BLOCKS), inputs))
         if wanted.points:
-            inputs = [first, samples, self.keep, self.z, self.point_grad, self.origin.grad, self.direction.grad]
+            inputs = [first, samples, self.keep, self.keep, self.z, self.point_grad]
+            inputs += [self.origin.grad, self.direction.grad]
             result.append((rays.collect_ray_gradients, stop - first, inputs))
         return result
 

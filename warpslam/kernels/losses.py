@@ -45,18 +45,22 @@ def tracking_residuals(
     depth: wp.array(dtype=float),
     variance: wp.array(dtype=float),
     include_missing: int,
+    normalize: int,
     sigma: wp.array(dtype=float),
     residual: wp.array(dtype=float),
     candidate_count: wp.array(dtype=int),
 ):
-    """Normalised depth residuals; those the median runs over are >= 0, the others -1 (rays without depth: an option).
+    """Depth residuals, in metres or in standard deviations; those the median runs over are >= 0, the others -1 (rays
+    without depth: an option).
     """
     tid = wp.tid()
     s = wp.sqrt(variance[tid] + 1.0e-10)
     sigma[tid] = s
     r = float(-1.0)
     if keep[tid] != 0 and (include_missing != 0 or measured_depth[tid] > 0.0):
-        r = wp.abs(measured_depth[tid] - depth[tid]) / s
+        r = wp.abs(measured_depth[tid] - depth[tid])
+        if normalize != 0:
+            r /= s
         wp.atomic_add(candidate_count, 0, 1)
     residual[tid] = r
 

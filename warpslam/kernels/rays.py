@@ -382,12 +382,15 @@ def collect_ray_gradients(
     start: int,
     sample_count: int,
     keep: wp.array(dtype=int),
+    counts: wp.array(dtype=int),
     z: wp.array(dtype=float),
     point_grad: wp.array(dtype=wp.vec3),
     origin_grad: wp.array(dtype=wp.vec3),
     direction_grad: wp.array(dtype=wp.vec3),
 ):
-    """Adjoint of p = o + z d, summed over the samples of a ray; clears ``point_grad`` for the next iteration."""
+    """Adjoint of p = o + z d, summed over the samples of a ray that ``counts``; clears ``point_grad`` for the next
+    iteration.
+    """
     tid = start + wp.tid()
     if keep[tid] == 0:
         return
@@ -398,5 +401,6 @@ def collect_ray_gradients(
         do += g
         dd += z[tid * sample_count + n] * g
         point_grad[tid * sample_count + n] = wp.vec3()
-    origin_grad[tid] = origin_grad[tid] + do
-    direction_grad[tid] = direction_grad[tid] + dd
+    if counts[tid] != 0:
+        origin_grad[tid] = origin_grad[tid] + do
+        direction_grad[tid] = direction_grad[tid] + dd
