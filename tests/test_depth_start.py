@@ -6,7 +6,8 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.decoders import load_decoders, random_decoders
-from warpslam.depth_start import REACH, TRUNCATION, DepthStart, fit_signed_distance, logit_and_derivative
+from warpslam.depth_start import TRUNCATION, DepthStart, fit_signed_distance, logit_and_derivative
+from warpslam.frustum import REACH
 from warpslam.kernels.grid import Vec32
 from warpslam.scene import FeatureGrid
 
@@ -76,7 +77,7 @@ def test_vertices_start_by_their_distance(start):
     seen = (z > 0) & (u >= 0) & (u < 64) & (v >= 0) & (v < 48) & (z - WALL <= REACH * 0.32)
     assert 0 < (seen & selected).sum() < seen.sum()
     np.testing.assert_array_equal(changed, seen & selected)
-    np.testing.assert_array_equal(grid.started.numpy() != 0, seen & selected)
+    np.testing.assert_array_equal(grid.seen.numpy() != 0, seen & selected)
     distance = np.clip(z - WALL, -TRUNCATION * 0.32, TRUNCATION * 0.32)
     expected = start.base + distance[:, None] * start.slope
     np.testing.assert_allclose(grid.features.numpy()[changed], expected[changed], rtol=1e-4, atol=1e-4)
@@ -91,8 +92,8 @@ def test_a_started_vertex_is_the_optimisers(start):
     first = applied(start, grid, holes, everything)
     second = applied(start, grid, np.full((48, 64), 2.5), everything)
     assert first.any() and second.any() and not (first & second).any()
-    kept = grid.features.numpy()[grid.started.numpy() != 0]
+    kept = grid.features.numpy()[grid.seen.numpy() != 0]
     grid.cover(np.array([-2.0, -1.0, -0.5]), np.array([1.0, 1.0, 4.0]))
-    assert grid.started.numpy().sum() == (first | second).sum()
-    np.testing.assert_array_equal(grid.features.numpy()[grid.started.numpy() != 0], kept)
+    assert grid.seen.numpy().sum() == (first | second).sum()
+    np.testing.assert_array_equal(grid.features.numpy()[grid.seen.numpy() != 0], kept)
     assert grid.features.dtype == Vec32

@@ -22,6 +22,7 @@ from warpslam.synthetic import SyntheticSequence
 
 SETTINGS = ("tracking.optimizer=adam", "mapping.first_iterations=12", "mapping.iterations=6")
 KERNELS = {
+    "mark_seen", "drop_unseen",
     "fill_grid", "project_vertices", "select_vertices", "clear_moments", "draw_pixels", "cast_rays", "bound_rays",
     "probe_pixels", "accumulate_errors", "place_samples",
     "start_rays", "coarse_forward", "coarse_backward", "middle_forward", "fine_forward",

@@ -133,13 +133,36 @@ def test_given_poses_are_taken(frames):
         slam.step(frames[3].rgb, frames[3].depth)
 
 
+def test_tracking_goes_by_what_was_seen(frames):
+    """Forgetting one half of what was seen leaves the rays into the other half; the share of inliers is theirs, until
+    next to nothing is left. With the setting off all rays count.
+    """
+    settings = ("tracking.lost_inliers=0.2", "tracking.relocalization=false")
+    slam, paper = run(frames[:1], *settings), run(frames[:1], *settings, "tracking.seen_only=false")
+
+    def next_result(slam: Slam, share: float) -> tuple[int, float, str]:
+        """Forget all but a share of the seen vertices; rays that count, share of inliers and status of a frame."""
+        seen = slam.scene.grids["color"].seen
+        flags = seen.numpy()
+        flags[int(share * len(flags)) :] = 0
+        seen.assign(flags)
+        result = slam.step(frames[1].rgb, frames[1].depth)
+        return int(slam._tracker._batch.keep.numpy().sum()), result.inliers, result.status
+
+    whole, half, nothing = (next_result(slam, share) for share in (1.0, 0.5, 0.0))
+    assert 0 < half[0] < 0.8 * whole[0]
+    assert whole[1] > 0.9 and half[1] > 0.9
+    assert nothing[1:] == (0.0, "LOST")
+    assert next_result(paper, 0.0)[2] == "OK"
+
+
 def test_given_poses_start_the_map_from_depth(frames):
     """Where poses are given, vertices start from the depth unless the settings say no; where they are not, only if the
     settings say so.
     """
 
     def has_started(*overrides: str) -> bool:
-        return bool(run(frames[:1], *overrides).scene.grids["middle"].started.numpy().any())
+        return bool(run(frames[:1], *overrides).scene.grids["middle"].seen.numpy().any())
 
     given, off, on = "tracking.use_given_poses=true", "mapping.depth_start=false", "mapping.depth_start=true"
     assert has_started(given) and has_started(on)

@@ -19,7 +19,7 @@ from warpslam.state_file import StateFormat, read_state, write_state
 if TYPE_CHECKING:
     from warpslam.slam import Slam
 
-MAP_FORMAT = StateFormat("warpslam-map", 3)
+MAP_FORMAT = StateFormat("warpslam-map", 4)
 STATUSES = ("OK", "LOST", "SKIPPED")
 
 
@@ -89,7 +89,7 @@ def slam_state(slam: Slam) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         arrays[f"grid_{level}_first"] = grid.first
         arrays[f"grid_{level}_shape"] = np.array(grid.shape, np.int64)
         arrays[f"grid_{level}"] = grid.features.numpy()[: grid.row_count]
-        arrays[f"grid_{level}_started"] = grid.started.numpy()[: grid.row_count]
+        arrays[f"grid_{level}_seen"] = grid.seen.numpy()[: grid.row_count]
     for level in LEVELS:
         weights = getattr(slam.scene.decoder_weights, level)
         if level == "color":
@@ -153,8 +153,8 @@ def slam_from_state(
         nx, ny, nz = state.array(f"grid_{level}_shape", np.int64, (3,)).tolist()
         first = state.array(f"grid_{level}_first", np.int64, (3,))
         features = state.array(f"grid_{level}", np.float32, (nx * ny * nz, 32))
-        started = state.array(f"grid_{level}_started", np.uint8, (nx * ny * nz,))
-        grid.restore(first.copy(), (nx, ny, nz), features, started)
+        seen = state.array(f"grid_{level}_seen", np.uint8, (nx * ny * nz,))
+        grid.restore(first.copy(), (nx, ny, nz), features, seen)
 
     size = (camera.height, camera.width)
     frames = state.frames("keyframes", count)

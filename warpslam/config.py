@@ -84,6 +84,11 @@ class TrackingConfig(_Group):
     median_includes_missing: bool = Field(
         False, description="rays without depth count in the median, as in the released code"
     )
+    seen_only: bool = Field(
+        True,
+        description="only rays count that end where a mapped frame has measured something, for elsewhere the map is a "
+        "guess; off = all rays (paper)",
+    )
     constant_speed: bool = Field(True, description="start from the last motion instead of the last pose")
     keep_best: Literal["last", "fixed_pixels"] = Field(
         "fixed_pixels",
@@ -352,7 +357,7 @@ def _parse_override(text: str) -> dict[str, Any]:
 # "paper_*" hold the released configurations (rotation_rate_factor 0.2 = "separate rates") with the paper's optimiser.
 # The others are
 # ours: Gauss-Newton tracking, and work cut to what two CPU cores do in minutes; BENCHMARK.md has what they reach.
-_PAPER: dict[str, Any] = {"optimizer": "adam", "final_rate_factor": 1.0}
+_PAPER: dict[str, Any] = {"optimizer": "adam", "final_rate_factor": 1.0, "seen_only": False}
 
 
 def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, Any]:

@@ -20,16 +20,15 @@ import warp as wp
 from warpslam.camera import Intrinsics
 from warpslam.decoders import BLOCK_COUNT, EMBEDDING_SIZE, FEATURE_SIZE, SKIP_BLOCK, DecoderWeights
 from warpslam.field import camera_vectors
+from warpslam.frustum import REACH
 from warpslam.kernels import frustum
 from warpslam.kernels.grid import Vec32
 from warpslam.profiling import phase
 from warpslam.scene import FeatureGrid
 
-# Of the logit by the distance, and the largest distances, in vertex spacings; a cell that the surface passes through
-# has corners up to its diagonal behind it.
+# Of the logit by the distance, and the largest distance, in vertex spacings.
 STEEPNESS = 2.56
 TRUNCATION = 1.6
-REACH = 1.75
 _POINTS = 1500
 _EXTENT = 6.0  # [m] points of the fit lie so far from the origin, along each axis
 _ITERATIONS = 50
@@ -54,7 +53,7 @@ class DepthStart:
         """Start what a frame sees first.
 
         Args:
-            grid: Of the middle level; `FeatureGrid.started` says what has been started.
+            grid: Of the middle level; `FeatureGrid.seen` says what has been started.
             camera: Intrinsics of the depth image.
             T_world_camera: Pose of the frame (4, 4).
             depth: Depth image on the device [m], float32 (H, W), 0 = missing.
@@ -67,7 +66,7 @@ class DepthStart:
             frustum.start_from_depth,
             dim=grid.shape,
             inputs=inputs,
-            outputs=[grid.started, grid.features],
+            outputs=[grid.seen, grid.features],
             device=grid.device,
             record_tape=False,
         )

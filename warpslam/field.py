@@ -150,6 +150,7 @@ class FieldArrays:
 
     lattices, features: by level; features are arrays of `Vec32`, one row a vertex.
     decoders: packed weights by level.
+    seen: uint8, one a vertex of the colour level: 1 where a mapped frame has measured what is there; None = unknown.
     low, high: the map's bound [m]; samples on or beyond it are opaque and constant.
     """
 
@@ -158,6 +159,7 @@ class FieldArrays:
     decoders: dict[str, PackedDecoder]
     low: wp.vec3
     high: wp.vec3
+    seen: wp.array | None = None
 
 
 @dataclass
@@ -313,6 +315,11 @@ class RayBatch:
         self.launcher.call(self.max_depth.zero_)
         inputs = [low, high, self.origin, self.direction, self.measured_depth, int(use_depth)]
         self.launcher.launch(rays.bound_rays, self.count, [*inputs, self.t_exit, self.keep, self.max_depth])
+
+    def drop_unseen(self, arrays: FieldArrays) -> None:
+        """After `bound`: leave out the rays that end where no mapped frame has measured anything."""
+        inputs = [arrays.lattices["color"], arrays.seen, self.origin, self.direction, self.measured_depth, self.keep]
+        self.launcher.launch(rays.drop_unseen, self.count, inputs)
 
     def drop_contradicted(
         self,

@@ -1,4 +1,6 @@
-"""What one frame sees: the box of its measurements, and the grid vertices that it may change (A.1)."""
+"""What one frame sees: the box of its measurements, the grid vertices that it may change (A.1), and those at which it
+has measured something.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +12,9 @@ from warpslam.field import camera_vectors
 from warpslam.kernels import frustum
 from warpslam.kernels.grid import Lattice
 from warpslam.profiling import phase
+
+REACH = 1.75
+"""Of a measurement, behind its surface, in vertex spacings: the corners of the cell with the surface lie no farther."""
 
 
 @phase("frustum selection")
@@ -54,6 +59,27 @@ def select_in_frustum(
         record_tape=False,
     )
     return selected.numpy() != 0
+
+
+def mark_seen(
+    lattice: Lattice,
+    shape: tuple[int, int, int],
+    camera: Intrinsics,
+    T_world_camera: np.ndarray,
+    depth: wp.array,
+    reach: float,
+    seen: wp.array,
+) -> None:
+    """Mark the vertices in view that lie in front of a measured surface or less than ``reach`` [m] behind it.
+
+    Args:
+        lattice, shape, camera, T_world_camera, depth: As in `select_in_frustum`.
+        reach: See `REACH`.
+        seen: Becomes 1 there, and stays what it is elsewhere, uint8 (rows,).
+    """
+    T_camera_world = wp.mat44(np.linalg.inv(T_world_camera).astype(np.float32))
+    inputs = [lattice, T_camera_world, *camera_vectors(camera), depth, reach]
+    wp.launch(frustum.mark_seen, shape, inputs, [seen], device=depth.device, record_tape=False)
 
 
 def measured_extent(

@@ -17,7 +17,7 @@ from warpslam.camera import Intrinsics, pose_from_vector, vector_from_pose
 from warpslam.config import MappingConfig, SamplingConfig
 from warpslam.depth_start import DepthStart
 from warpslam.field import STAGES, Gradients, RayBatch, Thresholds
-from warpslam.frustum import select_in_frustum
+from warpslam.frustum import REACH, mark_seen, select_in_frustum
 from warpslam.keyframes import ImagePool, Keyframe, overlap_fractions
 from warpslam.launching import Launcher
 from warpslam.optimizers import ColorDecoderOptimizer, GridOptimizer, PoseOptimizer
@@ -261,6 +261,8 @@ class Mapper:
             optimizer.begin(grid, mask)
             if level == "middle" and self._depth_start is not None and not everything:
                 self._depth_start.apply(grid, self.camera, T_world_camera, depth, optimizer.selected)
+        grid = self.scene.grids["color"]
+        mark_seen(grid.lattice, grid.shape, self.camera, T_world_camera, depth, REACH * grid.spacing, grid.seen)
         self._decoder.begin()
 
     def _iterate(

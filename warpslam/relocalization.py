@@ -25,7 +25,7 @@ STEP_FACTOR = 5.0  # a step beyond this multiple of the recent ones is a jump
 ERROR_FACTOR = 1.5  # a pose found again errs no more than this multiple of the recent depth errors
 PROMISING_FACTOR = 4.0  # a pose whose depth error is this far above the limit is worth a long optimisation
 SHORT_FACTOR = 3  # iterations from each start and keyframe, as a multiple of those of tracking
-MIN_INLIERS = 0.6  # of a pose found again
+MIN_AGREEING = 0.6  # of all depth rays, at a pose found again: what looks past the map does not speak for it
 THUMBNAIL = (12, 16)  # rows, columns
 GREY_WEIGHT = 2.0  # how much a difference in grey, 0..1, counts beside a relative difference in depth
 MIN_SHARED = 0.3  # share of cells that two thumbnails must both have depth in
@@ -129,7 +129,7 @@ class Localizer:
             tried += [self._track_longer(arrays, images, index, pose) for pose in poses]
             best = min(tried, key=_badness, default=None)
         if best is None:
-            nowhere = TrackingResult(np.eye(4), np.inf, np.inf, 0.0)
+            nowhere = TrackingResult(np.eye(4), np.inf, np.inf, 0.0, 0.0)
             return Located(nowhere, "it is not known where the camera starts: there is no keyframe to compare with")
 
         # The long optimisation is dear: once, and from a pose that it can be expected to mend.
@@ -170,7 +170,8 @@ class Localizer:
         return ""
 
     def _is_found(self, result: TrackingResult, track: Track) -> bool:
-        return result.depth_error <= self._limit(track) and result.inliers >= max(MIN_INLIERS, self.config.lost_inliers)
+        needed = max(MIN_AGREEING, self.config.lost_inliers)
+        return result.depth_error <= self._limit(track) and result.agreeing >= needed
 
     def _limit(self, track: Track) -> float:
         """Largest mean depth error [m] of a pose that was found again."""
@@ -178,7 +179,7 @@ class Localizer:
 
 
 def _badness(result: TrackingResult) -> float:
-    return result.depth_error / max(result.inliers, 1e-3)
+    return result.depth_error / max(result.agreeing, 1e-3)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from warpslam.sequences.base import Frame, RgbdSequence
     from warpslam.slam import FrameResult, Slam
 
-RUN_FORMAT = StateFormat("warpslam-run", 2)
+RUN_FORMAT = StateFormat("warpslam-run", 3)
 
 # Room for more changes no result, and a run that ran out of it is one to resume.
 _FREE_TO_CHANGE = ("config.grid.max_gigabytes", "config.keyframes.max_gigabytes")

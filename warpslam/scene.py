@@ -29,7 +29,8 @@ class FeatureGrid:
     first: World lattice index of vertex 0, int64 (3,).
     shape: Vertices per axis.
     features: Array of `Vec32`, one row a vertex (`warpslam.kernels.grid.row_of`).
-    started: 1 where `warpslam.depth_start` has started a vertex, uint8 (rows,).
+    seen: 1 where a mapped frame has measured what is at a vertex, uint8 (rows,): of the colour level, which tracking
+        goes by (`RayBatch.drop_unseen`), and of the middle one, where `warpslam.depth_start` started it.
     """
 
     def __init__(self, level: str, spacing: float, std: float, seed: int, device: wp.Device) -> None:
@@ -37,7 +38,7 @@ class FeatureGrid:
         self.first = np.zeros(3, np.int64)
         self.shape = (0, 0, 0)
         self.features = wp.zeros(1, dtype=Vec32, device=device)
-        self.started = wp.zeros(1, dtype=wp.uint8, device=device)
+        self.seen = wp.zeros(1, dtype=wp.uint8, device=device)
         self.lattice = self._lattice()
 
     @property
@@ -61,30 +62,30 @@ class FeatureGrid:
         return True
 
     def _resize(self, first: np.ndarray, shape: tuple[int, int, int]) -> None:
-        old_lattice, old_features, old_started = self.lattice, self.features, self.started
+        old_lattice, old_features, old_seen = self.lattice, self.features, self.seen
         shift = self.first - first
         self.first, self.shape = first, shape
         self.lattice = self._lattice()
         self.features = wp.empty(self.row_count, dtype=Vec32, device=self.device)
-        self.started = wp.empty(self.row_count, dtype=wp.uint8, device=self.device)
+        self.seen = wp.empty(self.row_count, dtype=wp.uint8, device=self.device)
         wp.launch(
             grid_kernels.fill_grid,
             dim=shape,
             inputs=[self.lattice, wp.vec3i(*first), self.seed, LEVELS.index(self.level), self.std]
-            + [old_lattice, old_features, old_started, wp.vec3i(*shift)],
-            outputs=[self.features, self.started],
+            + [old_lattice, old_features, old_seen, wp.vec3i(*shift)],
+            outputs=[self.features, self.seen],
             device=self.device,
             record_tape=False,
         )
 
     def restore(
-        self, first: np.ndarray, shape: tuple[int, int, int], features: np.ndarray, started: np.ndarray
+        self, first: np.ndarray, shape: tuple[int, int, int], features: np.ndarray, seen: np.ndarray
     ) -> None:
-        """Put back a saved grid: ``features`` float32 (rows, 32), ``started`` uint8 (rows,)."""
+        """Put back a saved grid: ``features`` float32 (rows, 32), ``seen`` uint8 (rows,)."""
         self.first, self.shape = np.asarray(first, np.int64), tuple(int(n) for n in shape)
         self.lattice = self._lattice()
         self.features = wp.array(np.ascontiguousarray(features, np.float32), dtype=Vec32, device=self.device)
-        self.started = wp.array(np.ascontiguousarray(started, np.uint8), dtype=wp.uint8, device=self.device)
+        self.seen = wp.array(np.ascontiguousarray(seen, np.uint8), dtype=wp.uint8, device=self.device)
 
     def update_from(self, other: FeatureGrid, rows: wp.array | None) -> None:
         """Take over the extent of another grid of this level, and some of its rows: int (n,), None for none."""
@@ -93,7 +94,7 @@ class FeatureGrid:
         if rows is not None:
             inputs = [rows, other.features, self.features]
             wp.launch(grid_kernels.copy_rows, rows.shape[0], inputs, device=self.device, record_tape=False)
-            wp.copy(self.started, other.started)
+            wp.copy(self.seen, other.seen)
 
     def _lattice(self) -> Lattice:
         lattice = Lattice()
@@ -127,7 +128,7 @@ class SceneMap:
         """The same map in arrays of its own, which is meant to exist beside this one."""
         other = SceneMap(self.decoder_weights, self.config, self.device, self.seed)
         for level, grid in self.grids.items():
-            other.grids[level].restore(grid.first, grid.shape, grid.features.numpy(), grid.started.numpy())
+            other.grids[level].restore(grid.first, grid.shape, grid.features.numpy(), grid.seen.numpy())
         other.update_from(self, {})
         other._buffers = 1 + self._buffers
         return other
@@ -208,6 +209,7 @@ class SceneMap:
             decoders=self.decoders,
             low=wp.vec3(*self.low),
             high=wp.vec3(*self.high),
+            seen=self.grids["color"].seen,
         )
 
     def query_occupancy(self, points: np.ndarray, level: str = "fine") -> np.ndarray:

@@ -43,7 +43,7 @@ class FrameResult:
     T_world_camera: Estimated pose, float64 (4, 4); of a frame that is not OK, that of the last one that was.
     status: "OK"; "LOST" (the pose was not found, the map is untouched); "SKIPPED" (nothing usable in the frame).
     losses: Mean loss per ray: "tracking", and of the stages of mapping that was done by then.
-    inliers: Share of the depth rays that agree with the map, in [0, 1].
+    inliers: Share of the depth rays into what the map has seen that agree with it, in [0, 1].
     depth_error: Mean |measured - rendered depth| of the inliers [m].
     timings: Seconds by phase: "tracking", "mapping" (overlapped: waiting for it and taking it over), "keyframe".
     message: Why the frame is not OK.

@@ -16,6 +16,9 @@ from warpslam.keyframes import ImagePool
 from warpslam.launching import Launcher
 from warpslam.optimizers import PoseOptimizer
 
+MIN_SEEN_SHARE = 0.2
+"""Where less of a frame's depth lies in what the map has seen, the share of inliers goes down as if this much did."""
+
 
 @dataclass(frozen=True)
 class TrackingResult:
@@ -24,13 +27,15 @@ class TrackingResult:
     T_world_camera: Estimated pose (4, 4).
     loss: Mean loss per inlier on the fixed pixels.
     depth_error: Mean |D - D^| over the inliers [m].
-    inliers: Inliers over rays with a measured depth, in [0, 1].
+    inliers: Inliers over rays with a measured depth that count (`TrackingConfig.seen_only`), in [0, 1]; less if few do.
+    agreeing: Inliers over all rays with a measured depth, in [0, 1].
     """
 
     T_world_camera: np.ndarray
     loss: float
     depth_error: float
     inliers: float
+    agreeing: float
 
 
 class Tracker:
@@ -138,6 +143,9 @@ class Tracker:
         count = batch.count
         inlier = batch.inlier.numpy()[:count] != 0
         measured = batch.measured_depth.numpy()[:count]
+        has_depth = measured > 0
+        depth_count = max(int(has_depth.sum()), 1)
+        counting = max(int((has_depth & (batch.keep.numpy()[:count] != 0)).sum()), MIN_SEEN_SHARE * depth_count)
         inlier_count = int(inlier.sum())
         error = np.abs(measured - batch.depth.numpy()[:count])[inlier]
         loss = float(batch.loss.numpy()[0]) / inlier_count if inlier_count else np.inf
@@ -145,7 +153,8 @@ class Tracker:
             T_world_camera=pose_from_vector(vector),
             loss=loss if np.isfinite(loss) else np.inf,
             depth_error=float(error.mean()) if inlier_count else np.inf,
-            inliers=inlier_count / max(int((measured > 0).sum()), 1),
+            inliers=inlier_count / counting,
+            agreeing=inlier_count / depth_count,
         )
 
     def _render(
@@ -156,6 +165,8 @@ class Tracker:
         batch.draw(images.arrays, self._window, batch.capacity, self.camera, edges=edges)
         batch.cast(self._poses.poses, differentiate=tape is not None)
         batch.bound(arrays)
+        if config.seen_only:
+            batch.drop_unseen(arrays)
         batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)
         gradients = None if tape is None else Gradients(points=True)
         batch.render(arrays, "color", gradients, tape, thresholds=self._thresholds)
@@ -165,7 +176,7 @@ class Tracker:
         """What a recorded iteration stands on."""
         features = (arrays.features[level] for level in ("middle", "fine", "color"))
         weights = (arrays.decoders[level].weights for level in ("middle", "fine", "color"))
-        return (batch, batch.seeds, self._poses.poses, *features, *weights, *arrays.low, *arrays.high)
+        return (batch, batch.seeds, self._poses.poses, arrays.seen, *features, *weights, *arrays.low, *arrays.high)
 
     def _ray_seed(self, frame: int, iteration: int) -> int:
         return ray_seed(self.seed, 1, frame, iteration)

@@ -123,7 +123,7 @@ def outside_change(job: Job) -> dict[str, Any]:
     def snapshot(level: str) -> FeatureGrid:
         grid = slam.scene.grids[level]
         copy = FeatureGrid(level, grid.spacing, grid.std, slam.seed, device)
-        copy.restore(grid.first, grid.shape, grid.features.numpy(), grid.started.numpy())
+        copy.restore(grid.first, grid.shape, grid.features.numpy(), grid.seen.numpy())
         return copy
 
     for number, (frame, T_world_camera) in enumerate(islice(frames, 1 + MAPPING_CALLS * every)):

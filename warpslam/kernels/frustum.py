@@ -1,6 +1,6 @@
 """Frustum feature selection (A.1, Sec. 3.3): which vertices of a grid the current frame may change.
 
-`start_from_depth` is ours: see `warpslam.depth_start`.
+`mark_seen` and `start_from_depth` are ours: see `RayBatch.drop_unseen` and `warpslam.depth_start`.
 
 A vertex is selected if it projects inside the image and lies in front of the camera, no deeper than 0.5 m behind the
 measured surface
@@ -82,6 +82,44 @@ def select_vertices(
     selected[row] = wp.where(chosen, wp.uint8(1), wp.uint8(0))
 
 
+@wp.func
+def behind_surface(
+    p: wp.vec3, T_camera_world: wp.mat44, focal: wp.vec2, center: wp.vec2, image: wp.array2d(dtype=float)
+) -> float:
+    """How far a point lies behind the surface that its nearest pixel measures [m]; infinite where none does.
+
+    The nearest pixel: a mean over an outline is the depth of nothing.
+    """
+    q = wp.transform_point(T_camera_world, p)
+    if q[2] <= 0.0:
+        return wp.inf
+    pixel = nearest_pixel(q, focal, center)
+    u = pixel[0]
+    v = pixel[1]
+    if u < 0 or u >= image.shape[1] or v < 0 or v >= image.shape[0]:
+        return wp.inf
+    measured = image[v, u]
+    if measured <= 0.0:
+        return wp.inf
+    return q[2] - measured
+
+
+@wp.kernel(enable_backward=False)
+def mark_seen(
+    lattice: Lattice,
+    T_camera_world: wp.mat44,
+    focal: wp.vec2,
+    center: wp.vec2,
+    image: wp.array2d(dtype=float),
+    reach: float,
+    seen: wp.array(dtype=wp.uint8),
+):
+    """Vertices in view that lie in front of the measured surface or less than ``reach`` behind it."""
+    i, j, k = wp.tid()
+    if behind_surface(vertex_position(lattice, i, j, k), T_camera_world, focal, center, image) <= reach:
+        seen[row_of(lattice, i, j, k)] = wp.uint8(1)
+
+
 @wp.kernel(enable_backward=False)
 def start_from_depth(
     lattice: Lattice,
@@ -94,29 +132,16 @@ def start_from_depth(
     slope: Vec32,
     truncation: float,
     reach: float,
-    started: wp.array(dtype=wp.uint8),
+    seen: wp.array(dtype=wp.uint8),
     features: wp.array(dtype=Vec32),
 ):
     """Vertices seen for the first time. Once started, a vertex is the optimiser's."""
     i, j, k = wp.tid()
     row = row_of(lattice, i, j, k)
-    if selected[row] == wp.uint8(0) or started[row] != wp.uint8(0):
+    if selected[row] == wp.uint8(0) or seen[row] != wp.uint8(0):
         return
-    p = vertex_position(lattice, i, j, k)
-    q = wp.transform_point(T_camera_world, p)
-    if q[2] <= 0.0:
-        return
-    pixel = nearest_pixel(q, focal, center)
-    u = pixel[0]
-    v = pixel[1]
-    if u < 0 or u >= image.shape[1] or v < 0 or v >= image.shape[0]:
-        return
-    # The nearest pixel: a mean over an outline is the depth of nothing.
-    measured = image[v, u]
-    if measured <= 0.0:
-        return
-    distance = q[2] - measured
+    distance = behind_surface(vertex_position(lattice, i, j, k), T_camera_world, focal, center, image)
     if distance > reach:
         return
-    started[row] = wp.uint8(1)
+    seen[row] = wp.uint8(1)
     features[row] = base + wp.clamp(distance, -truncation, truncation) * slope

@@ -176,10 +176,10 @@ def fill_grid(
     std: float,
     old_lattice: Lattice,
     old_features: wp.array(dtype=Vec32),
-    old_started: wp.array(dtype=wp.uint8),
+    old_seen: wp.array(dtype=wp.uint8),
     shift: wp.vec3i,
     features: wp.array(dtype=Vec32),
-    started: wp.array(dtype=wp.uint8),
+    seen: wp.array(dtype=wp.uint8),
 ):
     """Fill a grid of any extent: rows of the old grid are kept, the others start random (``first``: world index of
     vertex 0).
@@ -193,10 +193,10 @@ def fill_grid(
     if a >= 0 and b >= 0 and c >= 0 and a < s[0] and b < s[1] and c < s[2]:
         old_row = row_of(old_lattice, a, b, c)
         features[row] = old_features[old_row]
-        started[row] = old_started[old_row]
+        seen[row] = old_seen[old_row]
     else:
         features[row] = init_normal(seed, level, first[0] + i, first[1] + j, first[2] + k, std)
-        started[row] = wp.uint8(0)
+        seen[row] = wp.uint8(0)
 
 
 @wp.kernel(enable_backward=False)

@@ -18,6 +18,8 @@ differentiated by the tape, the other kernels have no gradient.
 
 import warp as wp
 
+from warpslam.kernels.grid import Lattice, find_cell, row_of
+
 wp.set_module_options({"max_unroll": 16})
 
 
@@ -158,6 +160,27 @@ def least_and_largest_depth(
             least = wp.min(least, depth)
             largest = wp.max(largest, depth)
     return wp.vec2(least, largest)
+
+
+@wp.kernel(enable_backward=False)
+def drop_unseen(
+    lattice: Lattice,
+    seen: wp.array(dtype=wp.uint8),
+    ray_origin: wp.array(dtype=wp.vec3),
+    ray_direction: wp.array(dtype=wp.vec3),
+    depth: wp.array(dtype=float),
+    keep: wp.array(dtype=int),
+):
+    """Leave out rays that end in a cell with a vertex that no mapped frame has seen."""
+    tid = wp.tid()
+    if keep[tid] == 0 or depth[tid] <= 0.0:
+        return
+    corner = find_cell(lattice, ray_origin[tid] + depth[tid] * ray_direction[tid]).corner
+    for di in range(2):
+        for dj in range(2):
+            for dk in range(2):
+                if seen[row_of(lattice, corner[0] + di, corner[1] + dj, corner[2] + dk)] == wp.uint8(0):
+                    keep[tid] = 0
 
 
 @wp.kernel(enable_backward=False)
