@@ -23,7 +23,7 @@ class FrameRecord:
     """What became of a frame.
 
     index: Number in the sequence. timestamp: [s]. status: "OK", "LOST", "SKIPPED". message: Why it is not OK.
-    inliers: Share of depth rays that agree with the map. losses: Mean loss per ray by name. depth_error: Mean error of
+    inliers: See `warpslam.slam.FrameResult`. losses: Mean loss per ray by name. depth_error: Mean error of
     those rays [m].
     """
 

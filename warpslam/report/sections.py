@@ -195,7 +195,8 @@ def _tracking_charts(run: RunData, x: np.ndarray, marks: list[tuple[int, str, st
         "Inliers over time", x, [("estimate", "inliers", inliers)],
         x_label="time [s]", y_label="inliers [%]", marks=marks, top=105.0,
     )  # fmt: skip
-    content.append(element("figure", chart, element("figcaption", "Share of the depth rays that agree with the map.")))
+    caption = "Share of the depth rays into what the map has seen that agree with it."
+    content.append(element("figure", chart, element("figcaption", caption)))
     return element("div", content, class_="pair")
 
 
