@@ -3,7 +3,8 @@
     d_camera = ((u - cx) / fx, (v - cy) / fy, 1)      OpenCV axes, not normalised, so that the ray parameter is z-depth
     o, d     = t, R(q) d_camera                       pose vector (qw, qx, qy, qz, tx, ty, tz), q of any length
     t_exit   = min over axes of max over the two planes of (plane - o) / d
-    kept     : t_exit >= D                            D = 0 (no measurement) passes
+    kept     : t_exit >= D                            D = 0 (no measurement) passes; `drop_unseen` and
+                                                      `drop_contradicted` are ours
 
 Samples along a kept ray, with s in [0, 1] evenly spaced and D_max the largest D of the kept rays of the batch:
 
@@ -12,8 +13,7 @@ Samples along a kept ray, with s in [0, 1] evenly spaced and D_max the largest D
     16 near the surface: D > 0: [0.95 D, 1.05 D]; D = 0: [0.001, D_max]
 
 merged in ascending order into ``z``, shape (ray_count * sample_count,). Gradients reach o and d, never z: `cast_rays`
-is
-differentiated by the tape, the other kernels have no gradient.
+is differentiated by the tape, the other kernels have no gradient.
 """
 
 import warp as wp
