@@ -124,7 +124,7 @@ def track(steps: list[float], status: str = "", first: int = 0) -> Track:
     vectors = [vector_from_pose(np.eye(4)) + [0, 0, 0, 0, x, 0, 0] for x in np.cumsum([0.0, *steps])]
     names = {"O": "OK", "L": "LOST", "S": "SKIPPED"}
     words = [names[letter] for letter in status or "O" * len(vectors)]
-    return Track(vectors, words, [0.02] * len(vectors), first)
+    return Track(vectors, words, [0.02] * len(vectors), at(steps[-1] if steps else 0.0), first)
 
 
 def at(x: float) -> np.ndarray:

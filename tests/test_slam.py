@@ -133,6 +133,20 @@ def test_given_poses_are_taken(frames):
         slam.step(frames[3].rgb, frames[3].depth)
 
 
+def test_bundle_adjustment_is_no_motion(frames, monkeypatch):
+    """A correction of the last pose moves the start of the next frame by as much, and not by twice as much."""
+    slam = run(frames[:4])
+    track, starts = slam._tracker.track, []
+    monkeypatch.setattr(slam._tracker, "track", lambda *a, **k: starts.append(a[3]) or track(*a, **k))
+    vectors = [vector.copy() for vector in slam._vectors[-2:]]
+    before, last = (pose_from_vector(vector) for vector in vectors)
+    correction = np.array([0, 0, 0, 0, 0.05, 0, 0])
+    slam._write_back(3, vectors[1] + correction)
+    slam.step(frames[4].rgb, frames[4].depth)
+    expected = pose_from_vector(vectors[1] + correction) @ np.linalg.inv(before) @ last
+    np.testing.assert_allclose(starts[0], expected, atol=1e-6)
+
+
 def test_tracking_goes_by_what_was_seen(frames):
     """Forgetting one half of what was seen leaves the rays into the other half; the share of inliers is theirs, until
     next to nothing is left. With the setting off all rays count.

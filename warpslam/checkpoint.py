@@ -75,6 +75,7 @@ def slam_state(slam: Slam) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         "vectors": np.array(slam._vectors, np.float64).reshape(-1, 7),
         "status": np.array([STATUSES.index(status) for status in slam._status], np.uint8),
         "depth_errors": np.array(slam._depth_errors, np.float64),
+        "motion": slam._motion,
         "bounds": np.stack(slam.scene.bounds),
         "keyframe_poses": np.array([keyframe.pose for keyframe in slam.keyframes], np.float64).reshape(-1, 7),
         "seen": np.array([s.millimetres for s in slam._seen], np.uint16).reshape(-1, *_seen_size(slam.intrinsics)),
@@ -146,6 +147,7 @@ def slam_from_state(
         raise state.damaged("status", f"codes beyond {len(STATUSES) - 1}")
     slam._status = [STATUSES[code] for code in codes]
     slam._current, slam._mapped = (state.frame(name, count) for name in ("current", "mapped"))
+    slam._motion = state.array("motion", np.float64, (4, 4)).copy()
     slam._first = state.integer("first")
 
     slam.scene.restore_bounds(*state.array("bounds", np.float64, (2, 3)).copy())

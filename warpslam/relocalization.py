@@ -36,12 +36,15 @@ class Track:
     """What is known of the camera's motion so far.
 
     vectors: Pose vectors of all frames. status: Their status. depth_errors: Their mean depth errors [m].
+    motion: Of the last frame against the one before (4, 4), as it was tracked. The poses may say something else since:
+        bundle adjustment has moved one of them, and that is no motion of the camera.
     first: Frame from which the camera has moved without a break; poses before it say nothing of where it is.
     """
 
     vectors: Sequence[np.ndarray]
     status: Sequence[str]
     depth_errors: Sequence[float]
+    motion: np.ndarray
     first: int = 0
 
     @property
@@ -56,7 +59,7 @@ class Track:
             return []
         T = pose_from_vector(self.vectors[last])
         if constant_speed and last > self.first and last == len(self.status) - 1 and self.status[last - 1] == "OK":
-            return [T @ np.linalg.inv(pose_from_vector(self.vectors[last - 1])) @ T, T]
+            return [T @ self.motion, T]
         return [T]
 
     def is_jump(self, T_world_camera: np.ndarray, max_step: float, max_turn: float) -> bool:

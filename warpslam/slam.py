@@ -112,6 +112,7 @@ class Slam:
         self._timestamps: list[float] = []
         self._status: list[str] = []
         self._depth_errors: list[float] = []
+        self._motion = np.eye(4)
         self._first = 0
         self._seen: list[SeenDepth] = []
         self._current: int | None = None
@@ -173,7 +174,7 @@ class Slam:
         first = self.scene.is_empty
         if first and not self.config.mapping.enabled:
             raise InputError("the map is empty and mapping.enabled is off: load a map with Slam.load")
-        track = Track(self._vectors, self._status, self._depth_errors, self._first)
+        track = Track(self._vectors, self._status, self._depth_errors, self._motion, self._first)
         if first or self.config.tracking.use_given_poses or (track.last is None and given is not None):
             pose = np.eye(4) if given is None else given
         else:
@@ -185,6 +186,8 @@ class Slam:
             pose = self._last_pose() if message else tracked.T_world_camera
             if located.after_loss:
                 self._first = index
+        if status == "OK" and self._vectors:
+            self._motion = np.linalg.inv(self._last_pose()) @ pose
         self._append(vector_from_pose(pose), timestamp, status, depth_error if status == "OK" else 0.0)
 
         if status == "OK" and self.config.mapping.enabled:
