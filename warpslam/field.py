@@ -150,7 +150,7 @@ class FieldArrays:
 
     lattices, features: by level; features are arrays of `Vec32`, one row a vertex.
     decoders: packed weights by level.
-    seen: uint8, one a vertex of the colour level: 1 where a mapped frame has measured what is there; None = unknown.
+    seen: uint8, one a vertex of the colour level: 1 where a mapped frame has measured what is there; None = everywhere.
     low, high: the map's bound [m]; samples on or beyond it are opaque and constant.
     """
 
@@ -318,6 +318,8 @@ class RayBatch:
 
     def drop_unseen(self, arrays: FieldArrays) -> None:
         """After `bound`: leave out the rays that end where no mapped frame has measured anything."""
+        if arrays.seen is None:
+            return
         inputs = [arrays.lattices["color"], arrays.seen, self.origin, self.direction, self.measured_depth, self.keep]
         self.launcher.launch(rays.drop_unseen, self.count, inputs)
 
