@@ -19,7 +19,7 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.decoders import BLOCK_COUNT, EMBEDDING_SIZE, FEATURE_SIZE, SKIP_BLOCK, DecoderWeights
-from warpslam.field import camera_vectors
+from warpslam.field import projection
 from warpslam.frustum import REACH
 from warpslam.kernels import frustum
 from warpslam.kernels.grid import Vec32
@@ -59,8 +59,7 @@ class DepthStart:
             depth: Depth image on the device [m], float32 (H, W), 0 = missing.
             selected: Only vertices that are 1 here change, uint8 (rows,).
         """
-        T_camera_world = wp.mat44(np.linalg.inv(T_world_camera).astype(np.float32))
-        inputs = [grid.lattice, T_camera_world, *camera_vectors(camera), depth, selected]
+        inputs = [grid.lattice, *projection(camera, T_world_camera), depth, selected]
         inputs += [Vec32(*self.base), Vec32(*self.slope), TRUNCATION * grid.spacing, REACH * grid.spacing]
         wp.launch(
             frustum.start_from_depth,

@@ -338,8 +338,7 @@ class RayBatch:
         margin: By how much [m].
         """
         _, depth, scale = images
-        T_camera_world = wp.mat44(np.linalg.inv(T_world_camera).astype(np.float32))
-        inputs = [current, margin, T_camera_world, *camera_vectors(camera), depth, scale]
+        inputs = [current, margin, *projection(camera, T_world_camera), depth, scale]
         inputs += [self.frame, self.origin, self.direction, self.measured_depth, self.keep]
         self.launcher.launch(rays.drop_contradicted, self.count, inputs)
 
@@ -646,3 +645,10 @@ def gradient_buffers(row_count: int, device: wp.Device) -> wp.array:
 def camera_vectors(camera: Intrinsics) -> list[wp.vec2]:
     """Focal lengths and principal point [px], as the kernels take them."""
     return [wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)]
+
+
+def projection(camera: Intrinsics, T_world_camera: np.ndarray) -> list[wp.mat44 | wp.vec2]:
+    """What brings world points into an image, as the kernels take it: T_camera_world of a pose (4, 4), and
+    `camera_vectors`.
+    """
+    return [wp.mat44(np.linalg.inv(T_world_camera).astype(np.float32)), *camera_vectors(camera)]

@@ -4,14 +4,19 @@ has measured something.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics
-from warpslam.field import camera_vectors
+from warpslam.field import projection
 from warpslam.kernels import frustum
 from warpslam.kernels.grid import Lattice
 from warpslam.profiling import phase
+
+if TYPE_CHECKING:
+    from warpslam.scene import FeatureGrid
 
 REACH = 1.75
 """Of a measurement, behind its surface, in vertex spacings: the corners of the cell with the surface lie no farther."""
@@ -41,11 +46,10 @@ def select_in_frustum(
     vertex_depth = wp.empty(rows, dtype=float, device=device)
     max_depth = wp.zeros(1, dtype=float, device=device)
     selected = wp.empty(rows, dtype=wp.uint8, device=device)
-    T_camera_world = wp.mat44(np.linalg.inv(T_world_camera).astype(np.float32))
     wp.launch(
         frustum.project_vertices,
         dim=shape,
-        inputs=[lattice, T_camera_world, *camera_vectors(camera), depth],
+        inputs=[lattice, *projection(camera, T_world_camera), depth],
         outputs=[looked_up, vertex_depth, max_depth],
         device=device,
         record_tape=False,
@@ -61,25 +65,15 @@ def select_in_frustum(
     return selected.numpy() != 0
 
 
-def mark_seen(
-    lattice: Lattice,
-    shape: tuple[int, int, int],
-    camera: Intrinsics,
-    T_world_camera: np.ndarray,
-    depth: wp.array,
-    reach: float,
-    seen: wp.array,
-) -> None:
-    """Mark the vertices in view that lie in front of a measured surface or less than ``reach`` [m] behind it.
+def mark_seen(grid: FeatureGrid, camera: Intrinsics, T_world_camera: np.ndarray, depth: wp.array) -> None:
+    """Mark the vertices in view that lie in front of a measured surface or no more than `REACH` behind it.
 
     Args:
-        lattice, shape, camera, T_world_camera, depth: As in `select_in_frustum`.
-        reach: See `REACH`.
-        seen: Becomes 1 there, and stays what it is elsewhere, uint8 (rows,).
+        grid: `FeatureGrid.seen` becomes 1 there, and stays what it is elsewhere.
+        camera, T_world_camera, depth: As in `select_in_frustum`.
     """
-    T_camera_world = wp.mat44(np.linalg.inv(T_world_camera).astype(np.float32))
-    inputs = [lattice, T_camera_world, *camera_vectors(camera), depth, reach]
-    wp.launch(frustum.mark_seen, shape, inputs, [seen], device=depth.device, record_tape=False)
+    inputs = [grid.lattice, *projection(camera, T_world_camera), depth, REACH * grid.spacing]
+    wp.launch(frustum.mark_seen, grid.shape, inputs, [grid.seen], device=grid.device, record_tape=False)
 
 
 def measured_extent(

@@ -17,7 +17,7 @@ from warpslam.camera import Intrinsics, pose_from_vector, vector_from_pose
 from warpslam.config import MappingConfig, SamplingConfig
 from warpslam.depth_start import DepthStart
 from warpslam.field import STAGES, Gradients, RayBatch, Thresholds
-from warpslam.frustum import REACH, mark_seen, select_in_frustum
+from warpslam.frustum import mark_seen, select_in_frustum
 from warpslam.keyframes import ImagePool, Keyframe, overlap_fractions
 from warpslam.launching import Launcher
 from warpslam.optimizers import ColorDecoderOptimizer, GridOptimizer, PoseOptimizer
@@ -246,7 +246,7 @@ class Mapper:
         return [*(candidates[n] for n in order), last]
 
     def _select(self, images: ImagePool, T_world_camera: np.ndarray, *, everything: bool) -> None:
-        """Which vertices of each level may change during this call."""
+        """Which vertices of each level may change during this call; and note those that the frame has measured."""
         depth = wp.array(images.depth_image(0), dtype=float, device=self.device)
         for level, optimizer in self._grids.items():
             grid = self.scene.grids[level]
@@ -261,8 +261,7 @@ class Mapper:
             optimizer.begin(grid, mask)
             if level == "middle" and self._depth_start is not None and not everything:
                 self._depth_start.apply(grid, self.camera, T_world_camera, depth, optimizer.selected)
-        grid = self.scene.grids["color"]
-        mark_seen(grid.lattice, grid.shape, self.camera, T_world_camera, depth, REACH * grid.spacing, grid.seen)
+        mark_seen(self.scene.grids["color"], self.camera, T_world_camera, depth)
         self._decoder.begin()
 
     def _iterate(

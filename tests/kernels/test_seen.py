@@ -39,7 +39,7 @@ def mark(scene_map: SceneMap, depth: np.ndarray) -> np.ndarray:
     """
     grid = scene_map.grids["color"]
     image = wp.array(depth, dtype=float, device=grid.device)
-    mark_seen(grid.lattice, grid.shape, CAMERA, np.eye(4), image, REACH * grid.spacing, grid.seen)
+    mark_seen(grid, CAMERA, np.eye(4), image)
     return grid.seen.numpy() != 0
 
 
