@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from warpslam.camera import Intrinsics, pose_from_vector
+from warpslam.camera import Intrinsics
 from warpslam.errors import DatasetError, MeshError
+from warpslam.poses import pose_from_vector
 from warpslam.sequences.base import Frame, RgbdSequence
 
 CAMERA = Intrinsics(20, 20, 15.5, 11.5, 32, 24)

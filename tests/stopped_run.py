@@ -16,8 +16,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from warpslam import batch_worker, cli, pipeline
-from warpslam.mapper import Mapper
+from warpslam import cli
+from warpslam.batch import worker as batch_worker
+from warpslam.mapping.mapper import Mapper
+from warpslam.pipeline import run as pipeline
 
 
 def kill_at(owner: Any, name: str, count: int) -> None:

@@ -8,11 +8,12 @@ import pytest
 import torch
 import warp as wp
 
-from warpslam.camera import Intrinsics, pose_from_vector
+from warpslam.camera import Intrinsics
 from warpslam.config import Config
-from warpslam.decoders import load_decoders
 from warpslam.errors import CheckpointError, ConfigError, InputError
-from warpslam.images import read_images
+from warpslam.field.decoder_files import load_decoders
+from warpslam.frames import read_images
+from warpslam.poses import pose_from_vector
 from warpslam.slam import Slam
 from warpslam.synthetic import SyntheticSequence
 

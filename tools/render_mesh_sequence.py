@@ -56,9 +56,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--radius", type=float, default=RADIUS, help="horizontal distance to the point [m]")
     parser.add_argument("--start", type=float, default=START_ANGLE, help="direction of the first camera [deg]")
     parser.add_argument("--step", type=float, default=STEP, help="distance between frames [m]; negative = clockwise")
-    parser.add_argument(
-        "--through", type=points, metavar='"X,Y X,Y ..."', help="walk through these points [m] instead"
-    )
+    parser.add_argument("--through", type=points, metavar='"X,Y X,Y ..."', help="walk through these points [m] instead")
     parser.add_argument("--max-depth", type=float, default=100.0, help="range of the depth camera [m]")
     parser.add_argument("--seed", type=int, default=0, help="seed of the hand's sway")
     parser.add_argument("--device", help="Warp device that renders")

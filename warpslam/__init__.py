@@ -13,11 +13,8 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from warpslam.camera import Intrinsics as Intrinsics
-    from warpslam.checking import check_folder as check_folder
     from warpslam.config import PRESETS as PRESETS
     from warpslam.config import Config as Config
-    from warpslam.decoders import Decoders as Decoders
-    from warpslam.decoders import load_decoders as load_decoders
     from warpslam.errors import CheckpointError as CheckpointError
     from warpslam.errors import ConfigError as ConfigError
     from warpslam.errors import DatasetError as DatasetError
@@ -31,24 +28,27 @@ if TYPE_CHECKING:
     from warpslam.errors import WarpSlamError as WarpSlamError
     from warpslam.evaluation import ate as ate
     from warpslam.evaluation import rpe as rpe
+    from warpslam.field.decoder_files import load_decoders as load_decoders
+    from warpslam.field.decoders import Decoders as Decoders
+    from warpslam.field.rendering import RenderedImage as RenderedImage
+    from warpslam.frames import FrameResult as FrameResult
     from warpslam.profiling import profile as profile
     from warpslam.sequences import open_sequence as open_sequence
     from warpslam.sequences.base import Frame as Frame
     from warpslam.sequences.base import RgbdSequence as RgbdSequence
-    from warpslam.slam import FrameResult as FrameResult
-    from warpslam.slam import RenderedImage as RenderedImage
+    from warpslam.sequences.checking import check_folder as check_folder
     from warpslam.slam import Slam as Slam
-    from warpslam.slam import Trajectory as Trajectory
+    from warpslam.trajectory import Trajectory as Trajectory
 
 _MODULE_OF = {
     "CheckpointError": "warpslam.errors",
     "Config": "warpslam.config",
     "ConfigError": "warpslam.errors",
     "DatasetError": "warpslam.errors",
-    "Decoders": "warpslam.decoders",
+    "Decoders": "warpslam.field.decoders",
     "Frame": "warpslam.sequences.base",
     "FrameError": "warpslam.errors",
-    "FrameResult": "warpslam.slam",
+    "FrameResult": "warpslam.frames",
     "InputError": "warpslam.errors",
     "Intrinsics": "warpslam.camera",
     "MapSizeError": "warpslam.errors",
@@ -57,14 +57,14 @@ _MODULE_OF = {
     "MissingDependencyError": "warpslam.errors",
     "OutputError": "warpslam.errors",
     "PRESETS": "warpslam.config",
-    "RenderedImage": "warpslam.slam",
+    "RenderedImage": "warpslam.field.rendering",
     "RgbdSequence": "warpslam.sequences.base",
     "Slam": "warpslam.slam",
-    "Trajectory": "warpslam.slam",
+    "Trajectory": "warpslam.trajectory",
     "WarpSlamError": "warpslam.errors",
     "ate": "warpslam.evaluation",
-    "check_folder": "warpslam.checking",
-    "load_decoders": "warpslam.decoders",
+    "check_folder": "warpslam.sequences.checking",
+    "load_decoders": "warpslam.field.decoder_files",
     "open_sequence": "warpslam.sequences",
     "profile": "warpslam.profiling",
     "rpe": "warpslam.evaluation",

@@ -4,60 +4,38 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
-from warpslam.camera import Intrinsics, check_number, check_transform, pose_from_vector, vector_from_pose
-from warpslam.compilation import compile_kernels
-from warpslam.complexity import field_flops, weight_count
+from warpslam.camera import Intrinsics, check_number
 from warpslam.config import Config
-from warpslam.decoders import Decoders, load_decoders
 from warpslam.errors import ConfigError, FrameError, InputError
-from warpslam.frustum import measured_extent
-from warpslam.images import read_images
-from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth, check_window_fits
-from warpslam.launching import synchronize
-from warpslam.mapper import Mapper
+from warpslam.field.complexity import field_flops, weight_count
+from warpslam.field.decoder_files import load_decoders
+from warpslam.field.decoders import Decoders
+from warpslam.field.rendering import RenderedImage, render_image
+from warpslam.frames import FrameResult, read_images
+from warpslam.mapping.frustum import measured_extent
+from warpslam.mapping.mapper import Mapper
+from warpslam.mapping.scheduler import MappingTask, new_scheduler
 from warpslam.meshing import ObservedView, extract_mesh
-from warpslam.profiling import phase
-from warpslam.relocalization import Localizer, Track
-from warpslam.rendering import RenderedImage, render_image
-from warpslam.scene import SceneMap
-from warpslam.scheduler import MappingTask, new_scheduler
-from warpslam.tracker import Tracker
-from warpslam.trajectory import Trajectory
+from warpslam.poses import check_transform, pose_from_vector, vector_from_pose
+from warpslam.runtime.compilation import compile_kernels
+from warpslam.runtime.launching import synchronize
+from warpslam.runtime.phases import phase
+from warpslam.scene.image_pool import ImagePool, check_window_fits
+from warpslam.scene.keyframes import Keyframe
+from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
+from warpslam.scene.scene_map import SceneMap
+from warpslam.tracking.localizer import Localizer
+from warpslam.tracking.tracker import Tracker
+from warpslam.trajectory import Track, Trajectory
 
 if TYPE_CHECKING:
     import trimesh
-
-
-@dataclass(frozen=True)
-class FrameResult:
-    """What `Slam.step` returns.
-
-    index: Frame number from 0. timestamp: [s].
-    T_world_camera: Estimated pose, float64 (4, 4); of a frame that is not OK, that of the last one that was.
-    status: "OK"; "LOST" (the pose was not found, the map is untouched); "SKIPPED" (nothing usable in the frame).
-    losses: Mean loss per ray: "tracking", and of the stages of mapping that was done by then.
-    inliers: Share of the depth rays into what the map has seen that agree with it, in [0, 1].
-    depth_error: Mean |measured - rendered depth| of the inliers [m].
-    timings: Seconds by phase: "tracking", "mapping" (overlapped: waiting for it and taking it over), "keyframe".
-    message: Why the frame is not OK.
-    """
-
-    index: int
-    timestamp: float
-    T_world_camera: np.ndarray
-    status: str = "OK"
-    losses: dict[str, float] = field(default_factory=dict)
-    inliers: float = 1.0
-    depth_error: float = 0.0
-    timings: dict[str, float] = field(default_factory=dict)
-    message: str = ""
 
 
 class Slam:
@@ -336,18 +314,18 @@ class Slam:
 
     @property
     def flops_per_point(self) -> int:
-        """Operations of the field at a point, forward (see `warpslam.complexity`)."""
+        """Operations of the field at a point, forward (see `warpslam.field.complexity`)."""
         return field_flops({decoder.level: decoder.hidden for decoder in self.scene.decoder_weights})["field"]
 
     def memory(self) -> dict[str, float | None]:
-        """Bytes of the map's state, in all and per observed cubic metre; see `warpslam.memory.memory_report`."""
-        from warpslam.memory import memory_report
+        """Bytes of the map's state, in all and per observed cubic metre; see `scene.inventory.memory_report`."""
+        from warpslam.scene.inventory import memory_report
 
         return memory_report(self)
 
     def save(self, path: str | Path) -> None:
         """Write map, keyframes, trajectory and settings to one file (plain arrays, no code)."""
-        from warpslam.checkpoint import save_slam
+        from warpslam.slam_state import save_slam
 
         save_slam(self, Path(path))
 
@@ -373,7 +351,7 @@ class Slam:
             CheckpointError: the file is missing, damaged, or of another version.
             ConfigError: ``config`` does not fit the map.
         """
-        from warpslam.checkpoint import load_slam
+        from warpslam.slam_state import load_slam
 
         return load_slam(Path(path), device, config=config, localize_only=localize_only)
 
@@ -398,9 +376,7 @@ class Slam:
     def _read_images(self, rgb: Any, depth: Any, depth_scale: float | None) -> tuple[np.ndarray, np.ndarray]:
         config = self.config
         is_colored = config.tracking.color_weight > 0 or config.mapping.color_weight > 0
-        return read_images(
-            rgb, depth, self.intrinsics, config.grid.max_depth, depth_scale, colored=is_colored
-        )
+        return read_images(rgb, depth, self.intrinsics, config.grid.max_depth, depth_scale, colored=is_colored)
 
     def _check_frame(self, timestamp: float, given: np.ndarray | None) -> np.ndarray | None:
         """The given pose if it is known; `FrameError` if it is needed and not known, or the time is no time."""

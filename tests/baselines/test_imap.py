@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from warpslam import pipeline
 from warpslam.baselines.imap import Imap
 from warpslam.camera import Intrinsics
 from warpslam.config import PRESETS, Config
 from warpslam.errors import CheckpointError, InputError
 from warpslam.evaluation import psnr
-from warpslam.run_folder import RunFolder
+from warpslam.pipeline import run as pipeline
+from warpslam.runs.folder import RunFolder
 
 CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5, 64, 48)
 SMALL = [

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpslam.baselines.imap_network import Bound, ImapBatch, ImapNetwork, Wanted, unpack
-from warpslam.camera import vector_from_pose
-from warpslam.complexity import imap_shapes
-from warpslam.field import gradient_buffers
-from warpslam.kernels import imap
-from warpslam.launching import Launcher
+from warpslam.baselines.imap_network import Bound, ImapBatch, ImapNetwork, Wanted, imap_shapes, unpack
+from warpslam.field.arrays import gradient_buffers
+from warpslam.kernels import imap_network as imap
+from warpslam.poses import vector_from_pose
+from warpslam.runtime.launching import Launcher
 from warpslam.synthetic import look_at
 
 torch = pytest.importorskip("torch")

@@ -7,12 +7,14 @@ import sys
 import numpy as np
 import pytest
 
-from warpslam import pipeline
 from warpslam.baselines.tsdf import BLOCK_VOXELS, Tsdf, import_open3d
-from warpslam.camera import Intrinsics, pose_from_vector
+from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.errors import CheckpointError, InputError, MeshError, MissingDependencyError
-from warpslam.run_folder import RunFolder, read_json
+from warpslam.pipeline import run as pipeline
+from warpslam.poses import pose_from_vector
+from warpslam.runs.folder import RunFolder
+from warpslam.storage.json_files import read_json
 
 CAMERA = Intrinsics(80.0, 80.0, 63.5, 47.5, 128, 96)
 RGB = (200, 100, 50)
@@ -132,7 +134,7 @@ def test_a_missing_package_is_named_with_what_to_type(monkeypatch):
 
 def test_a_run_with_the_poses_of_an_earlier_one(tmp_path):
     """The same pipeline, metrics and folder; poses come from a file, and errors are against the sequence's truth."""
-    from warpslam.evaluation import read_tum, write_tum
+    from warpslam.storage.tum import read_tum, write_tum
     from warpslam.synthetic import SyntheticSequence
 
     sequence = SyntheticSequence(0, 6, intrinsics=Intrinsics(62.5, 62.5, 39.5, 29.5, 80, 60))

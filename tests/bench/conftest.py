@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from warpslam import batch
+from warpslam.batch import local as batch
 
 
 @pytest.fixture

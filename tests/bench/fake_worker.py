@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from warpslam import batch_worker
-from warpslam.batch import FINISHED, Job
+from warpslam.batch import worker as batch_worker
+from warpslam.batch.jobs import Job
+from warpslam.batch.status import FINISHED
 from warpslam.errors import DatasetError
-from warpslam.run_folder import RunFolder, write_json
+from warpslam.runs.folder import RunFolder
+from warpslam.storage.json_files import write_json
 
 
 def fake_run(job: Job, folder: Path, report, watch, slot: int) -> tuple[str, str]:

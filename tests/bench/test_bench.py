@@ -11,7 +11,7 @@ from tests.report.html_checks import Page
 from warpslam import cli
 from warpslam.bench.runner import run_bench
 from warpslam.bench.suite import read_suite
-from warpslam.run_folder import read_json
+from warpslam.storage.json_files import read_json
 
 
 @pytest.fixture

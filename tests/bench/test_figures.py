@@ -7,8 +7,9 @@ import pytest
 
 from warpslam.bench.figures import gap_figures, read_figures
 from warpslam.errors import DatasetError
-from warpslam.evaluation import write_tum
-from warpslam.run_folder import RunFolder, write_json
+from warpslam.runs.folder import RunFolder
+from warpslam.storage.json_files import write_json
+from warpslam.storage.tum import write_tum
 
 
 def test_units(tmp_path):

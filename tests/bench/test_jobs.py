@@ -10,7 +10,7 @@ import pytest
 from warpslam.bench.jobs import expand, render_missing, unique_jobs
 from warpslam.bench.suite import read_suite
 from warpslam.errors import ConfigError
-from warpslam.run_folder import read_json
+from warpslam.storage.json_files import read_json
 
 
 def test_settings_of_a_job(write_suite, tmp_path):

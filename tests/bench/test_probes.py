@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from warpslam.batch import Job
+from warpslam.batch.jobs import Job
 from warpslam.bench.probes import PROBES, convergence, measure, outside_change
 from warpslam.camera import Intrinsics
 from warpslam.errors import DatasetError

@@ -8,7 +8,7 @@ import pytest
 
 from warpslam.bench.results import Outcome, Row, StudyResult, Summary, published_row, to_dict
 from warpslam.bench.studies import METRICS, STUDIES
-from warpslam.run_folder import to_json
+from warpslam.storage.json_files import to_json
 
 ATE, FLOPS = METRICS["ate"], METRICS["flops"]
 COLOR = STUDIES["color"]

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from warpslam.camera import Intrinsics, pose_from_vector
+from warpslam.camera import Intrinsics
 from warpslam.errors import ConfigError, MeshError
 from warpslam.evaluation import PROTOCOLS, Culling, Views, sample_surface, visible_points
 from warpslam.evaluation.culling import _ball_in_frustum
+from warpslam.poses import pose_from_vector
 
 CAMERA = Intrinsics(100, 100, 49.5, 49.5, 100, 100)
 

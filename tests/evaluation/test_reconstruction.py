@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import trimesh
 
-from warpslam.camera import pose_from_vector
 from warpslam.errors import InputError, MeshError
 from warpslam.evaluation import (
     accuracy,
@@ -19,6 +18,7 @@ from warpslam.evaluation import (
     reconstruction_metrics,
     sample_surface,
 )
+from warpslam.poses import pose_from_vector
 
 
 def plane(width: float, z: float) -> trimesh.Trimesh:

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from warpslam.camera import pose_from_vector
 from warpslam.errors import DatasetError, InputError
-from warpslam.evaluation import align_horn, associate, ate, read_tum, rpe, transform_poses, write_tum
-from warpslam.evaluation.trajectory import rotation_angles
+from warpslam.evaluation import align_horn, ate, rpe
+from warpslam.poses import pose_from_vector, rotation_angles, transform_poses
+from warpslam.storage.tum import associate, read_tum, write_tum
 
 
 def random_poses(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from warpslam.camera import Intrinsics
-from warpslam.field import RayBatch
+from warpslam.field.ray_batch import RayBatch
 
 
 def pixels_of(batch: RayBatch, camera: Intrinsics) -> tuple[np.ndarray, np.ndarray]:

@@ -9,8 +9,10 @@ import torch
 import warp as wp
 
 from tests.reference import oracle
-from warpslam.decoders import DecoderWeights
-from warpslam.field import FieldArrays, Gradients, GridGradient, PackedDecoder, RayBatch, gradient_buffers
+from warpslam.field.arrays import FieldArrays, Gradients, GridGradient, gradient_buffers
+from warpslam.field.decoders import DecoderWeights
+from warpslam.field.packing import PackedDecoder
+from warpslam.field.ray_batch import RayBatch
 from warpslam.kernels import decoder
 from warpslam.kernels.grid import Lattice, Vec32
 

@@ -7,15 +7,16 @@ import pytest
 import warp as wp
 
 from tests.kernels.drawn_pixels import pixels_of
-from warpslam.active_sampling import CELLS, LARGEST_ERROR, CellErrors
-from warpslam.camera import Intrinsics, vector_from_pose
+from warpslam.camera import Intrinsics
 from warpslam.config import GridConfig, SamplingConfig
-from warpslam.decoders import load_decoders
-from warpslam.field import RayBatch
+from warpslam.field.decoder_files import load_decoders
+from warpslam.field.ray_batch import RayBatch
 from warpslam.kernels import rays
-from warpslam.keyframes import ImagePool
-from warpslam.launching import Launcher
-from warpslam.scene import SceneMap
+from warpslam.mapping.active_sampling import CELLS, LARGEST_ERROR, CellErrors
+from warpslam.poses import vector_from_pose
+from warpslam.runtime.launching import Launcher
+from warpslam.scene.image_pool import ImagePool
+from warpslam.scene.scene_map import SceneMap
 
 CAMERA = Intrinsics(80.0, 80.0, 79.5, 59.5, 160, 120)
 CELL_COUNT = CELLS[0] * CELLS[1]
@@ -104,9 +105,7 @@ def test_without_any_error_all_cells_are_alike(device):
     depth = wp.full(2 * CELL_COUNT, 1.0, dtype=float, device=device)
     keep = wp.full(2 * CELL_COUNT, 1, dtype=int, device=device)
     cumulative = wp.zeros((2, CELL_COUNT), dtype=float, device=device)
-    wp.launch(
-        rays.accumulate_errors, 2, [CELL_COUNT, LARGEST_ERROR, keep, depth, depth], [cumulative], device=device
-    )
+    wp.launch(rays.accumulate_errors, 2, [CELL_COUNT, LARGEST_ERROR, keep, depth, depth], [cumulative], device=device)
     steps = np.diff(cumulative.numpy(), axis=1)
     np.testing.assert_allclose(steps, steps.mean(), rtol=1e-2)
     assert steps.min() > 0.0

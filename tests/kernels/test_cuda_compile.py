@@ -5,17 +5,14 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import warp as wp
 
 import warpslam
-from warpslam.compilation import find_module, module_names
-
-sys.path.append(str(Path(__file__).resolve().parents[2] / "tools"))
-from cuda_registers import REGISTER_LIMIT, KernelResources, compiled_cubin, markdown_table, read_cubin  # noqa: E402
+from tools.benchmarks.cuda_registers import REGISTER_LIMIT, KernelResources, compiled_cubin, markdown_table, read_cubin
+from warpslam.runtime.compilation import find_module, module_names
 
 ARCHITECTURES = (80, 90)
 # Bytes that may be spilled, and why they are.
@@ -23,7 +20,7 @@ SPILLING = {
     "color_backward": (16, "holds the gradients of two layers for the weights of the embedding"),
     "layer_weights": (1200, "of the baseline: sums eight rows of 32 at once"),
 }
-BUILT = {"warpslam.decoder_cuda": "warpslam.kernels.decoder", "warpslam.imap_cuda": "warpslam.kernels.imap"}
+BUILT = {"warpslam.decoder_cuda": "warpslam.kernels.decoder", "warpslam.imap_cuda": "warpslam.kernels.imap_network"}
 """Warp modules that a function builds, and the Python modules that call it."""
 
 
@@ -45,7 +42,7 @@ def test_every_kernel_module_is_found():
 
 def test_a_run_compiles_every_module_beforehand():
     """What is loaded when a run starts is all there is, but for the renderer of synthetic rooms and the baseline."""
-    others = {"warpslam.synthetic.raycast", "warpslam.imap_cuda", "warpslam.kernels.density"}
+    others = {"warpslam.kernels.raycast", "warpslam.imap_cuda", "warpslam.kernels.imap_density"}
     for target in ("cpu", "cuda"):
         expected = {name.replace("decoder_cuda", f"decoder_{target}") for name in kernel_modules()}
         assert set(module_names(target)) == expected - others

@@ -12,8 +12,8 @@ import pytest
 
 from tests.kernels.iteration import Iteration
 from tests.kernels.random_scene import random_field, random_rays
-from warpslam.decoders import DecoderWeights
-from warpslam.field import PackedDecoder
+from warpslam.field.decoders import DecoderWeights
+from warpslam.field.packing import PackedDecoder
 
 SEED = 5
 COLOR_WEIGHT = {"mapping": 0.2, "tracking": 0.5}

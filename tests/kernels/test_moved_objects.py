@@ -7,9 +7,10 @@ import pytest
 import warp as wp
 
 from tests.kernels.drawn_pixels import pixels_of
-from warpslam.camera import Intrinsics, vector_from_pose
-from warpslam.field import RayBatch
-from warpslam.keyframes import ImagePool
+from warpslam.camera import Intrinsics
+from warpslam.field.ray_batch import RayBatch
+from warpslam.poses import vector_from_pose
+from warpslam.scene.image_pool import ImagePool
 
 CAMERA = Intrinsics(80.0, 80.0, 79.5, 59.5, 160, 120)
 RAYS = 4000

@@ -9,9 +9,9 @@ import warp as wp
 from tests.kernels.iteration import Iteration, Rays, field_on_device, relative_error
 from tests.reference.oracle import STAGES
 from warpslam.camera import Intrinsics
-from warpslam.field import RayBatch
-from warpslam.frustum import select_in_frustum
+from warpslam.field.ray_batch import RayBatch
 from warpslam.kernels import adam
+from warpslam.mapping.frustum import select_in_frustum
 
 
 @pytest.fixture(scope="module")

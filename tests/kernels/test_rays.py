@@ -5,12 +5,14 @@ import pytest
 import warp as wp
 
 from tests.kernels.drawn_pixels import pixels_of
-from warpslam.camera import Intrinsics, vector_from_pose
+from warpslam.camera import Intrinsics
 from warpslam.config import GridConfig
-from warpslam.decoders import load_decoders
-from warpslam.field import Gradients, GridGradient, RayBatch, Thresholds, gradient_buffers
-from warpslam.keyframes import ImagePool
-from warpslam.scene import SceneMap
+from warpslam.field.arrays import Gradients, GridGradient, Thresholds, gradient_buffers
+from warpslam.field.decoder_files import load_decoders
+from warpslam.field.ray_batch import RayBatch
+from warpslam.poses import vector_from_pose
+from warpslam.scene.image_pool import ImagePool
+from warpslam.scene.scene_map import SceneMap
 
 CAMERA = Intrinsics(40.0, 42.0, 31.0, 23.5, 64, 48)
 RAYS = 300

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warpslam.camera import Intrinsics, vector_from_pose
+from warpslam.camera import Intrinsics
 from warpslam.config import GridConfig
-from warpslam.decoders import random_decoders
-from warpslam.field import FieldArrays, RayBatch
-from warpslam.frustum import REACH, mark_seen
-from warpslam.keyframes import ImagePool
-from warpslam.scene import SceneMap
+from warpslam.field.arrays import FieldArrays
+from warpslam.field.decoders import random_decoders
+from warpslam.field.ray_batch import RayBatch
+from warpslam.mapping.frustum import REACH, mark_seen
+from warpslam.poses import vector_from_pose
+from warpslam.scene.image_pool import ImagePool
+from warpslam.scene.scene_map import SceneMap
 
 CAMERA = Intrinsics(50.0, 50.0, 31.5, 23.5, 64, 48)
 WALL = 2.0  # [m]
@@ -35,8 +37,7 @@ def wall_with_hole() -> np.ndarray:
 
 
 def mark(scene_map: SceneMap, depth: np.ndarray) -> np.ndarray:
-    """Mark what a camera at the origin measures; returns which vertices of the colour level are marked, bool (rows,).
-    """
+    """Mark what a camera at the origin measures; returns which colour vertices are marked, bool (rows,)."""
     grid = scene_map.grids["color"]
     image = wp.array(depth, dtype=float, device=grid.device)
     mark_seen(grid, CAMERA, np.eye(4), image)

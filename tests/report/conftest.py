@@ -9,10 +9,13 @@ from typing import Any
 import pytest
 
 from tests.fakes import FakeSequence, FakeSlam, wall
-from warpslam import pipeline, plots
 from warpslam.config import Config
-from warpslam.report import images
-from warpslam.run_folder import RunFolder, Source, read_json, write_json
+from warpslam.pipeline import run as pipeline
+from warpslam.report import pictures as images
+from warpslam.report import plots
+from warpslam.runs.folder import RunFolder
+from warpslam.runs.request import Source
+from warpslam.storage.json_files import read_json, write_json
 
 LEVELS = {
     level: {"spacing_m": spacing, "shape": [4, 5, 6], "bytes": 4 * 5 * 6 * 128}

@@ -12,7 +12,7 @@ from warpslam.errors import ConfigError
 from warpslam.report import write_comparison
 from warpslam.report.comparison import run_names
 from warpslam.report.data import RunData
-from warpslam.run_folder import read_json, write_json
+from warpslam.storage.json_files import read_json, write_json
 
 
 def test_comparison_of_runs(make_run, tmp_path):

@@ -9,8 +9,8 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from warpslam.report import images
-from warpslam.report.images import VIEW_HEIGHT, VIEW_WIDTH, color_map, data_uri, mesh_views
+from warpslam.report import pictures as images
+from warpslam.report.pictures import VIEW_HEIGHT, VIEW_WIDTH, color_map, data_uri, mesh_views
 
 
 def decoded(uri: str) -> np.ndarray:

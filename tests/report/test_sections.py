@@ -13,7 +13,8 @@ from warpslam.errors import ConfigError, DatasetError, MeshError
 from warpslam.report import write_report
 from warpslam.report.accounts import stage_seconds
 from warpslam.report.data import RunData, axis_name, upright_axes
-from warpslam.run_folder import RunFolder, read_json, write_json
+from warpslam.runs.folder import RunFolder
+from warpslam.storage.json_files import read_json, write_json
 
 SECTIONS = (
     "figures", "trajectory", "error", "images", "mesh", "keyframes", "timing", "memory", "frames", "settings",

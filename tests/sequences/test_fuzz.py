@@ -12,10 +12,10 @@ import pytest
 
 from tests.sequences import writers
 from tests.sequences.mutations import damage
-from warpslam.camera import check_transform
-from warpslam.checking import check_folder
 from warpslam.errors import DatasetError, WarpSlamError
+from warpslam.poses import check_transform
 from warpslam.sequences import open_sequence
+from warpslam.sequences.checking import check_folder
 
 ROUNDS = 90
 """Damaged folders of each of the seven formats."""

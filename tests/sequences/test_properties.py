@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.sequences import writers
-from warpslam.camera import check_transform, pose_from_vector
 from warpslam.errors import DatasetError
+from warpslam.poses import check_transform, pose_from_vector
 from warpslam.sequences import open_sequence
 from warpslam.sequences.calibration import CAMERA_FIELDS, Calibration
 from warpslam.sequences.files import frame_number
-from warpslam.sequences.images import natural_key
-from warpslam.sequences.poses import read_matrix_file, read_matrix_lines, read_redwood_log, read_tum_poses
+from warpslam.sequences.image_files import natural_key
+from warpslam.sequences.pose_files import read_matrix_file, read_matrix_lines, read_redwood_log, read_tum_poses
 
 # The same examples on every machine, however busy it is.
 seeded = settings(deadline=None, derandomize=True)

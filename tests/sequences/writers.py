@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from warpslam.camera import pose_from_vector
+from warpslam.poses import pose_from_vector
 
 WIDTH, HEIGHT = 24, 16
 CAMERA = f"20,21,11.5,7.5,{WIDTH},{HEIGHT},1000"

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from warpslam.camera import Intrinsics, check_transform, pose_from_vector, vector_from_pose
+from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.errors import FrameError
-from warpslam.images import read_images
-from warpslam.slam import FrameResult
+from warpslam.frames import FrameResult, read_images
+from warpslam.poses import check_transform, pose_from_vector, vector_from_pose
 from warpslam.trajectory import Trajectory
 
 

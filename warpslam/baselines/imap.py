@@ -26,18 +26,23 @@ import warp as wp
 
 from warpslam.baselines.base import Baseline
 from warpslam.baselines.imap_network import Bound, ImapBatch, ImapNetwork, Wanted
-from warpslam.camera import Intrinsics, check_transform, pose_from_vector, vector_from_pose
-from warpslam.complexity import flops_per_point, weight_count
+from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.errors import CheckpointError, InputError
-from warpslam.kernels import adam, density, imap, losses, rays
-from warpslam.keyframes import SEEN_STRIDE, ImagePool, Keyframe, SeenDepth
-from warpslam.launching import Launcher, synchronize
+from warpslam.field.complexity import flops_per_point, weight_count
+from warpslam.field.rendering import RenderedImage
+from warpslam.field.seeds import ray_seed
+from warpslam.frames import FrameResult
+from warpslam.kernels import adam, losses, rays
+from warpslam.kernels import imap_density as density
+from warpslam.kernels import imap_network as imap
 from warpslam.meshing import ObservedView, extract_mesh
-from warpslam.optimizers import PoseOptimizer, RowOptimizer
-from warpslam.rendering import RenderedImage
-from warpslam.slam import FrameResult
-from warpslam.tracker import ray_seed
+from warpslam.poses import check_transform, pose_from_vector, vector_from_pose
+from warpslam.runtime.launching import Launcher, synchronize
+from warpslam.scene.image_pool import ImagePool
+from warpslam.scene.keyframes import Keyframe
+from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
+from warpslam.scene.optimizers import PoseOptimizer, RowOptimizer
 
 if TYPE_CHECKING:
     import trimesh
@@ -283,7 +288,7 @@ class Imap(Baseline):
 
     @property
     def flops_per_point(self) -> int:
-        """Operations of the network at a point, forward (see `warpslam.complexity`)."""
+        """Operations of the network at a point, forward (see `warpslam.field.complexity`)."""
         return flops_per_point("imap")
 
     @property

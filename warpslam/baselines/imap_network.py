@@ -8,12 +8,14 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from warpslam.complexity import imap_shapes
-from warpslam.decoders import EMBEDDING_SCALE
-from warpslam.field import RayBatch
-from warpslam.kernels import density, imap, rays
+from warpslam.field.decoders import EMBEDDING_SCALE, EMBEDDING_SIZE
+from warpslam.field.ray_batch import RayBatch
+from warpslam.kernels import imap_density as density
+from warpslam.kernels import imap_network as imap
+from warpslam.kernels import rays
 from warpslam.kernels.grid import Vec32
-from warpslam.launching import Launcher, Step, run_slices
+from warpslam.runtime.launching import Launcher, Step
+from warpslam.runtime.program import run_slices
 
 _CHUNK = 256  # points whose weight gradients a thread sums
 _IN_BLOCKS = (imap.EMBEDDING_BLOCKS, imap.BLOCKS, imap.BLOCKS, imap.BLOCKS)
@@ -61,7 +63,7 @@ class ImapNetwork:
             self.launcher.launch(self.kernels.transpose, 256 * blocks, inputs)
 
     def tensors(self) -> dict[str, np.ndarray]:
-        """The weights by name, shapes as in `warpslam.complexity.imap_shapes`."""
+        """The weights by name, shapes as in `warpslam.field.complexity.imap_shapes`."""
         return unpack(self.weights.numpy())
 
 
@@ -105,7 +107,7 @@ class Wanted:
 
 
 class ImapBatch(RayBatch):
-    """Rays through the network; pixels, rays, bounds and losses are those of `warpslam.field.RayBatch`.
+    """Rays through the network; pixels, rays, bounds and losses are those of `warpslam.field.ray_batch.RayBatch`.
 
     stratified, importance, empty: Samples a ray of each kind; density and colour of the first two are composited.
     training: Whether activations are kept for the adjoint.
@@ -251,3 +253,19 @@ class ImapBatch(RayBatch):
 def _channels(x: wp.array) -> wp.array:
     """The same memory with the 32 channels of a `Vec32` as a third axis."""
     return wp.array(ptr=x.ptr, dtype=float, shape=(*x.shape, 32), device=x.device, copy=False)
+
+
+IMAP_HIDDEN = 256
+IMAP_LAYERS = 4
+IMAP_OUTPUTS = 4  # red, green, blue, density
+
+
+def imap_shapes() -> dict[str, tuple[int, ...]]:
+    """Name and shape, (out, in), of every tensor of the network of iMAP*."""
+    shapes: dict[str, tuple[int, ...]] = {"embedder._B": (3, EMBEDDING_SIZE)}
+    for k in range(IMAP_LAYERS):
+        shapes[f"pts_linears.{k}.weight"] = (IMAP_HIDDEN, EMBEDDING_SIZE if k == 0 else IMAP_HIDDEN)
+        shapes[f"pts_linears.{k}.bias"] = (IMAP_HIDDEN,)
+    shapes["output_linear.weight"] = (IMAP_OUTPUTS, IMAP_HIDDEN)
+    shapes["output_linear.bias"] = (IMAP_OUTPUTS,)
+    return shapes

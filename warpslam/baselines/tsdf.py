@@ -18,11 +18,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warpslam.baselines.base import Baseline
-from warpslam.camera import Intrinsics, check_transform, vector_from_pose
+from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.errors import CheckpointError, InputError, MeshError, MissingDependencyError
-from warpslam.rendering import RenderedImage
-from warpslam.slam import FrameResult
+from warpslam.field.rendering import RenderedImage
+from warpslam.frames import FrameResult
+from warpslam.poses import check_transform, vector_from_pose
 
 if TYPE_CHECKING:
     import trimesh

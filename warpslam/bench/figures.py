@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from warpslam.errors import DatasetError
-from warpslam.evaluation import read_tum
-from warpslam.run_folder import RunFolder, read_json
+from warpslam.runs.folder import RunFolder
+from warpslam.storage.json_files import read_json
+from warpslam.storage.tum import read_tum
 
 MIN_GAP = 5
 """A gap is at least this many times as long as the time between two frames usually is."""

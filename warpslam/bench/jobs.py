@@ -8,11 +8,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from warpslam.batch import Job
-from warpslam.batch_manifest import parse_slice
+from warpslam.batch.jobs import Job
 from warpslam.bench.studies import Study, Variant
 from warpslam.bench.suite import Rendering, SequenceSpec, StudySpec, Suite
-from warpslam.run_folder import as_file_name, read_json, write_json
+from warpslam.runs.folder import as_file_name
+from warpslam.runs.request import parse_slice
+from warpslam.storage.json_files import read_json, write_json
 
 RENDERED = "rendered"
 """Folder in the bench's own that holds sequences it rendered."""

@@ -14,7 +14,7 @@ from warpslam.bench.tables import bench_facts, header, how_to_read, made_with, p
 from warpslam.report.page import Html, element, figures, join, missing, page, section, table, void, write_page
 
 if TYPE_CHECKING:
-    from warpslam.bench.runner import Bench
+    from warpslam.bench.results import Bench
 
 
 def write_bench_page(bench: Bench) -> Path:

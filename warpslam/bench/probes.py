@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpslam.batch import Job
+from warpslam.batch.jobs import Job
 from warpslam.errors import DatasetError
-from warpslam.run_folder import read_json, write_json
+from warpslam.storage.json_files import read_json, write_json
 
 if TYPE_CHECKING:
     from warpslam.config import Config
-    from warpslam.scene import FeatureGrid
+    from warpslam.scene.feature_grid import FeatureGrid
     from warpslam.sequences.base import Frame, RgbdSequence
 
 PROBE_FOLDER = "probes"
@@ -54,14 +54,14 @@ def convergence(job: Job) -> dict[str, Any]:
     """
     import warp as wp
 
-    from warpslam.camera import vector_from_pose
-    from warpslam.decoders import load_decoders
-    from warpslam.frustum import measured_extent
-    from warpslam.images import read_images
-    from warpslam.keyframes import ImagePool
-    from warpslam.mapper import Mapper
-    from warpslam.rendering import render_image
-    from warpslam.scene import SceneMap
+    from warpslam.field.decoder_files import load_decoders
+    from warpslam.field.rendering import render_image
+    from warpslam.frames import read_images
+    from warpslam.mapping.frustum import measured_extent
+    from warpslam.mapping.mapper import Mapper
+    from warpslam.poses import vector_from_pose
+    from warpslam.scene.image_pool import ImagePool
+    from warpslam.scene.scene_map import SceneMap
 
     sequence, config, frames = _open(job)
     first = next(frames, None)
@@ -106,10 +106,10 @@ def outside_change(job: Job) -> dict[str, Any]:
     """
     import warp as wp
 
-    from warpslam.frustum import select_in_frustum
-    from warpslam.images import read_images
-    from warpslam.keyframes import ImagePool
-    from warpslam.scene import FeatureGrid
+    from warpslam.frames import read_images
+    from warpslam.mapping.frustum import select_in_frustum
+    from warpslam.scene.feature_grid import FeatureGrid
+    from warpslam.scene.image_pool import ImagePool
     from warpslam.slam import Slam
 
     sequence, config, frames = _open(job)
@@ -158,9 +158,10 @@ PROBES: dict[str, Callable[[Job], dict[str, Any]]] = {"convergence": convergence
 def _open(job: Job) -> tuple[RgbdSequence, Config, Iterator[tuple[Frame, np.ndarray]]]:
     """Sequence, settings, and those of the selected frames that have a pose, with it."""
     from warpslam.config import Config
-    from warpslam.pipeline import GivenPoses, load_kernels, select_frames
-    from warpslam.revisit import open_source
-    from warpslam.run_folder import Source
+    from warpslam.pipeline.finished import open_source
+    from warpslam.pipeline.setup import load_kernels, select_frames
+    from warpslam.runs.given_poses import GivenPoses
+    from warpslam.runs.request import Source
 
     sequence = open_source(Source(job.path, job.dataset, job.camera))
     config = Config.from_preset(job.preset or sequence.preset, list(job.overrides)).with_files(job.decoders, None)

@@ -5,10 +5,14 @@ from __future__ import annotations
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+from warpslam.batch.jobs import Job
+from warpslam.batch.status import FINISHED, INTERRUPTED, SKIPPED, JobStatus
 from warpslam.bench.studies import METRICS, Expectation, Metric, Study, Variant
-from warpslam.bench.suite import published_figures
+from warpslam.bench.suite import Suite, published_figures
+from warpslam.runs.folder import RunFolder
 
 
 @dataclass(frozen=True)
@@ -258,3 +262,37 @@ def to_dict(result: StudyResult) -> dict[str, Any]:
             for d in result.directions()
         ],
     }  # fmt: skip
+
+
+RUNS = "runs"
+"""Folder of the bench that holds a run folder for each job."""
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A bench that was run, as far as it came.
+
+    suite: What was run. folder: Where. command: How it was started, if by the command line.
+    jobs, statuses: Its runs and how they ended. results: By study.
+    """
+
+    suite: Suite
+    folder: Path
+    command: str | None
+    jobs: tuple[Job, ...]
+    statuses: tuple[JobStatus, ...]
+    results: tuple[StudyResult, ...]
+
+    def run_folder(self, run: str) -> RunFolder:
+        """Folder of one of its runs."""
+        return RunFolder(self.folder / RUNS / run)
+
+    @property
+    def is_interrupted(self) -> bool:
+        """Whether ctrl-C ended it early."""
+        return any(status.status == INTERRUPTED for status in self.statuses)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every run has its results."""
+        return all(status.status in (FINISHED, SKIPPED) for status in self.statuses)

@@ -3,52 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from warpslam.batch import FINISHED, INTERRUPTED, SKIPPED, Job, JobStatus, Update, run_batch
+from warpslam.batch.local import run_batch
+from warpslam.batch.status import FINISHED, INTERRUPTED, SKIPPED, JobStatus, Update
 from warpslam.bench.figures import gap_figures, read_figures
 from warpslam.bench.jobs import Entry, expand, render_missing, unique_jobs
-from warpslam.bench.results import Outcome, Row, StudyResult, published_row
+from warpslam.bench.results import RUNS, Bench, Outcome, Row, StudyResult, published_row
 from warpslam.bench.suite import Suite
 from warpslam.errors import WarpSlamError
-from warpslam.run_folder import RunFolder, read_json
-
-RUNS = "runs"
-"""Folder of the bench that holds a run folder for each job."""
+from warpslam.runs.folder import RunFolder
+from warpslam.storage.json_files import read_json
 
 Say = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Bench:
-    """A bench that was run, as far as it came.
-
-    suite: What was run. folder: Where. command: How it was started, if by the command line.
-    jobs, statuses: Its runs and how they ended. results: By study.
-    """
-
-    suite: Suite
-    folder: Path
-    command: str | None
-    jobs: tuple[Job, ...]
-    statuses: tuple[JobStatus, ...]
-    results: tuple[StudyResult, ...]
-
-    def run_folder(self, run: str) -> RunFolder:
-        """Folder of one of its runs."""
-        return RunFolder(self.folder / RUNS / run)
-
-    @property
-    def is_interrupted(self) -> bool:
-        """Whether ctrl-C ended it early."""
-        return any(status.status == INTERRUPTED for status in self.statuses)
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether every run has its results."""
-        return all(status.status in (FINISHED, SKIPPED) for status in self.statuses)
 
 
 def run_bench(
@@ -80,7 +48,7 @@ def run_bench(
     """
     from warpslam.bench.page import write_bench_page
     from warpslam.bench.tables import write_tables
-    from warpslam.output import output_error
+    from warpslam.storage.writing import output_error
 
     output, say = Path(output), say or (lambda text: None)
     entries = expand(suite, output, None if studies is None else list(studies))

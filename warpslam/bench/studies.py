@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from warpslam.complexity import field_flops
-from warpslam.method import DEFAULT_METHOD
+from warpslam.field.complexity import field_flops
+from warpslam.pipeline.methods import DEFAULT_METHOD
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ METRICS = {
 class Variant:
     """One thing that a study compares.
 
-    name: As shown. overrides: Settings ``group.field=value``. method: Of `warpslam.method.METHODS`.
+    name: As shown. overrides: Settings ``group.field=value``. method: Of `warpslam.pipeline.methods.METHODS`.
     position: Where a curve over the variants has it.
     figures: What is known without a run and takes the place of the run's figure.
     """

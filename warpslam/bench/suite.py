@@ -14,10 +14,10 @@ from typing import Any, Literal
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from warpslam.batch_manifest import parse_slice
 from warpslam.bench.studies import STUDIES, Study
 from warpslam.config import Config
 from warpslam.errors import ConfigError
+from warpslam.runs.request import parse_slice
 
 SHIPPED = ("quick",)
 """Suites that come with the package."""

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 from warpslam import __version__
 from warpslam.bench.results import Row, StudyResult, to_dict
 from warpslam.bench.studies import Metric
-from warpslam.run_folder import read_json, write_json
+from warpslam.storage.json_files import read_json, write_json
 
 if TYPE_CHECKING:
-    from warpslam.bench.runner import Bench
+    from warpslam.bench.results import Bench
 
 PAPER = "paper"
 """What marks the rows of published figures."""

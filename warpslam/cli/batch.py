@@ -10,18 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from warpslam.cli.common import (
-    EXIT_INTERRUPTED,
-    add_command,
-    add_method_option,
-    add_run_options,
-    parse_frames,
-)
+from warpslam.cli.common import EXIT_INTERRUPTED, add_command, add_method_option, add_run_options, parse_frames
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from warpslam.batch import Job, JobStatus
+    from warpslam.batch.jobs import Job
+    from warpslam.batch.status import JobStatus
 
 EXIT_UNFINISHED = 1
 CHECKPOINT_EVERY = 50
@@ -49,20 +44,21 @@ def add(commands: Any) -> None:
 
 
 def _batch(options: argparse.Namespace) -> int:
-    from warpslam.batch import INTERRUPTED, run_batch
-    from warpslam.batch_summary import is_good, write_summary
+    from warpslam.batch.local import run_batch
+    from warpslam.batch.status import INTERRUPTED
+    from warpslam.batch.summary import is_good, write_summary
 
     jobs = _jobs(options)
     output = Path(options.output or "batch")
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        from warpslam.output import output_error
+        from warpslam.storage.writing import output_error
 
         raise output_error(error, output) from error
     with progress() as on_update:
         if options.cluster:
-            from warpslam.cluster import run_on_ray
+            from warpslam.batch.ray_cluster import run_on_ray
 
             statuses = run_on_ray(
                 jobs, output, address=options.cluster, workers=options.workers, memory_gb=options.memory_gb,
@@ -80,8 +76,8 @@ def _batch(options: argparse.Namespace) -> int:
 
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
-    from warpslam.batch import Job, with_free_names
-    from warpslam.batch_manifest import read_manifest
+    from warpslam.batch.jobs import Job, with_free_names
+    from warpslam.batch.manifest import read_manifest
 
     frames = options.frames
     common = Job(
@@ -125,7 +121,7 @@ class _Lines:
 
     def show(self, status: JobStatus) -> None:
         """Print, if there is something new."""
-        from warpslam.batch_summary import first_line
+        from warpslam.batch.summary import first_line
 
         tenth = _LINES_A_JOB * status.done // status.total if status.total else 0
         if self._last.get(status.name) == (status.status, tenth):
@@ -147,8 +143,8 @@ def _table(statuses: Sequence[JobStatus]) -> Any:
     from rich.table import Table
     from rich.text import Text
 
-    from warpslam.batch import RUNNING, WAITING
-    from warpslam.batch_summary import COLUMNS, cells, is_good
+    from warpslam.batch.status import RUNNING, WAITING
+    from warpslam.batch.summary import COLUMNS, cells, is_good
 
     table = Table()
     for number, column in enumerate(COLUMNS):

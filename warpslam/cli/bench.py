@@ -57,9 +57,9 @@ def _bench(options: argparse.Namespace) -> int:
 
 
 def _print_list(entries: list[Entry], output: Path) -> None:
-    from warpslam.batch import BatchState
+    from warpslam.batch.status import BatchState
     from warpslam.bench.jobs import unique_jobs
-    from warpslam.bench.runner import RUNS
+    from warpslam.bench.results import RUNS
 
     seeds: dict[tuple[str, str, str], list[str]] = {}
     for entry in entries:

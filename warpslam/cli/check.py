@@ -21,8 +21,8 @@ def add(commands: Any) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from warpslam.checking import THOROUGH_SAMPLES, check_folder
-    from warpslam.run_folder import to_json
+    from warpslam.sequences.checking import THOROUGH_SAMPLES, check_folder
+    from warpslam.storage.json_files import to_json
 
     count = None if options.all else THOROUGH_SAMPLES
     report = check_folder(options.folder, options.dataset, options.camera, sample_count=count)

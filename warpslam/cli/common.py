@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from warpslam.method import DEFAULT_METHOD, METHODS
+from warpslam.pipeline.methods import DEFAULT_METHOD, METHODS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -57,8 +57,8 @@ def add_method_option(parser: argparse.ArgumentParser) -> None:
 
 def parse_frames(text: str) -> slice:
     """A slice of frames from A:B or A:B:STEP."""
-    from warpslam.batch_manifest import parse_slice
     from warpslam.errors import ConfigError
+    from warpslam.runs.request import parse_slice
 
     try:
         return slice(*parse_slice(text))

@@ -31,8 +31,9 @@ def add(commands: Any) -> None:
 
 def _eval(options: argparse.Namespace) -> int:
     from warpslam.evaluation import DEFAULT_PROTOCOL, PROTOCOLS
-    from warpslam.revisit import evaluate_run
-    from warpslam.run_folder import RunFolder, to_json
+    from warpslam.pipeline.finished import evaluate_run
+    from warpslam.runs.folder import RunFolder
+    from warpslam.storage.json_files import to_json
 
     quiet_warp()
     # The default comes first, so that "reconstruction" is of the same protocol with and without the others.

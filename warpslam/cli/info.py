@@ -18,11 +18,11 @@ def _info(options: argparse.Namespace) -> int:
     import platform
 
     from warpslam import __version__
-    from warpslam.complexity import field_flops, flops_per_point
     from warpslam.config import PRESETS
-    from warpslam.decoders import DEFAULT_PATH, load_decoders
+    from warpslam.field.complexity import field_flops, flops_per_point
+    from warpslam.field.decoder_files import DEFAULT_PATH, load_decoders
+    from warpslam.runtime.environment import package_versions
     from warpslam.sequences import DATASETS
-    from warpslam.versions import package_versions
 
     print(f"warpslam    {__version__}, Python {platform.python_version()}, {platform.platform()}")
     for package, version in package_versions().items():

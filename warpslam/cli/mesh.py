@@ -28,8 +28,8 @@ def add(commands: Any) -> None:
 
 
 def _mesh(options: argparse.Namespace) -> int:
-    from warpslam.revisit import extract_mesh
-    from warpslam.run_folder import RunFolder
+    from warpslam.pipeline.finished import extract_mesh
+    from warpslam.runs.folder import RunFolder
 
     quiet_warp()
     mesh, path = extract_mesh(

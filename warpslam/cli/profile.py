@@ -6,13 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from warpslam.cli.common import (
-    add_command,
-    add_sequence_options,
-    add_slam_options,
-    quiet_warp,
-    warnings_on_stderr,
-)
+from warpslam.cli.common import add_command, add_sequence_options, add_slam_options, quiet_warp, warnings_on_stderr
 
 if TYPE_CHECKING:
     from warpslam.config import Config
@@ -38,7 +32,7 @@ def _profile(options: argparse.Namespace) -> int:
     from rich.console import Console
 
     from warpslam.errors import ConfigError
-    from warpslam.run_setup import select_frames
+    from warpslam.pipeline.setup import select_frames
 
     quiet_warp()
     for option, file in (("--json", options.json), ("--trace", options.trace)):
@@ -67,10 +61,10 @@ def _profile(options: argparse.Namespace) -> int:
 
 
 def _input(options: argparse.Namespace) -> tuple[RgbdSequence, Config]:
-    from warpslam import demo
     from warpslam.config import Config
-    from warpslam.revisit import open_source
-    from warpslam.run_folder import Source
+    from warpslam.pipeline.finished import open_source
+    from warpslam.runs.request import Source
+    from warpslam.synthetic import demo
 
     if options.folder == "demo":
         preset, overrides = options.preset or demo.PRESET, [*demo.OVERRIDES, *options.overrides]
@@ -83,8 +77,8 @@ def _input(options: argparse.Namespace) -> tuple[RgbdSequence, Config]:
 def _run(sequence: RgbdSequence, config: Config, selected: range, options: argparse.Namespace) -> Profile:
     from warpslam import profile
     from warpslam.errors import MeshError
-    from warpslam.profiling import phase
-    from warpslam.run_setup import build_slam, load_kernels
+    from warpslam.pipeline.setup import build_slam, load_kernels
+    from warpslam.runtime.phases import phase
 
     with profile() as result:
         with phase("setup"):

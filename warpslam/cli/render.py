@@ -18,8 +18,8 @@ def add(commands: Any) -> None:
 
 
 def _render(options: argparse.Namespace) -> int:
-    from warpslam.revisit import render_frame
-    from warpslam.run_folder import RunFolder
+    from warpslam.pipeline.finished import render_frame
+    from warpslam.runs.folder import RunFolder
 
     quiet_warp()
     print(render_frame(RunFolder.open(options.run), options.frame, options.output, options.device))

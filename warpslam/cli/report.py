@@ -19,7 +19,7 @@ def add(commands: Any) -> None:
 
 def _report(options: argparse.Namespace) -> int:
     from warpslam.report import write_comparison, write_report
-    from warpslam.run_folder import RunFolder
+    from warpslam.runs.folder import RunFolder
 
     quiet_warp()
     folders = [RunFolder.open(run) for run in options.runs]

@@ -24,10 +24,10 @@ from warpslam.cli.common import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from warpslam.compilation import ModuleProgress
     from warpslam.config import Config
-    from warpslam.pipeline import Progress, RunResult
-    from warpslam.run_folder import Source
+    from warpslam.runs.record import Progress, RunResult
+    from warpslam.runs.request import Source
+    from warpslam.runtime.compilation import ModuleProgress
     from warpslam.sequences.base import RgbdSequence
 
 _PLAIN_LINES = 20
@@ -71,12 +71,13 @@ def _add_checkpoint_option(parser: argparse.ArgumentParser) -> None:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from warpslam.checkpoint import saved_config
     from warpslam.config import Config
     from warpslam.errors import ConfigError
     from warpslam.evaluation import load_mesh
-    from warpslam.revisit import open_source
-    from warpslam.run_folder import RunFolder, Source
+    from warpslam.pipeline.finished import open_source
+    from warpslam.runs.folder import RunFolder
+    from warpslam.runs.request import Source
+    from warpslam.slam_state import saved_config
 
     quiet_warp()
     if options.resume is not None:
@@ -112,9 +113,9 @@ def _resume(options: argparse.Namespace) -> int:
     from warpslam.config import Config
     from warpslam.errors import ConfigError
     from warpslam.evaluation import load_mesh
-    from warpslam.resume import read_checkpoint
-    from warpslam.revisit import open_source
-    from warpslam.run_folder import RunFolder
+    from warpslam.pipeline.checkpoints import read_checkpoint
+    from warpslam.pipeline.finished import open_source
+    from warpslam.runs.folder import RunFolder
 
     for name in ("preset", "map", "localize", "output", "camera", "decoders"):
         if getattr(options, name):
@@ -146,9 +147,9 @@ def _resume(options: argparse.Namespace) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from warpslam import demo
     from warpslam.config import Config
-    from warpslam.run_folder import Source
+    from warpslam.runs.request import Source
+    from warpslam.synthetic import demo
 
     quiet_warp()
     config = Config.from_preset(demo.PRESET, [*demo.OVERRIDES, *options.overrides])
@@ -159,7 +160,7 @@ def _demo(options: argparse.Namespace) -> int:
 def _execute(
     sequence: RgbdSequence, config: Config, source: Source, options: argparse.Namespace, **keywords: Any
 ) -> int:
-    from warpslam.pipeline import run
+    from warpslam.pipeline.run import run
 
     config = config.with_files(options.decoders, options.poses)
     with warnings_on_stderr(), _progress(sequence.name) as (on_frame, on_module):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from warpslam.cli.common import add_command, quiet_warp
 
 if TYPE_CHECKING:
-    from warpslam.compilation import ModuleProgress
+    from warpslam.runtime.compilation import ModuleProgress
 
 _EXPLANATION = """
 For cpu, cuda or cuda:N the kernels are compiled and loaded here, exactly as the first run would do it; runs on this
@@ -35,8 +35,8 @@ def add(commands: Any) -> None:
 def _warmup(options: argparse.Namespace) -> int:
     import warp as wp
 
-    from warpslam.compilation import compile_for_architecture, compile_kernels
-    from warpslam.run_setup import check_device
+    from warpslam.pipeline.setup import check_device
+    from warpslam.runtime.compilation import compile_for_architecture, compile_kernels
     from warpslam.synthetic.sequence import RenderedSequence
 
     quiet_warp()

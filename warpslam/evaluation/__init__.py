@@ -1,14 +1,7 @@
 """How good a run is: trajectories (`ate`, `rpe`), reconstructions under named protocols, and rendered images."""
 
-from warpslam.evaluation.culling import (
-    DEFAULT_PROTOCOL,
-    PROTOCOLS,
-    Culling,
-    Views,
-    sample_surface,
-    visible_points,
-)
-from warpslam.evaluation.images import depth_l1, psnr, rendering_metrics, ssim
+from warpslam.evaluation.culling import DEFAULT_PROTOCOL, PROTOCOLS, Culling, Views, sample_surface, visible_points
+from warpslam.evaluation.image_errors import depth_l1, psnr, rendering_metrics, ssim
 from warpslam.evaluation.protocols import evaluate_mesh
 from warpslam.evaluation.reconstruction import (
     ReconstructionResult,
@@ -21,20 +14,18 @@ from warpslam.evaluation.reconstruction import (
     load_mesh,
     reconstruction_metrics,
 )
-from warpslam.evaluation.trajectory import (
+from warpslam.evaluation.trajectory_errors import (
     AteResult,
     RpeResult,
     Statistics,
     align_horn,
-    associate,
     ate,
-    read_tum,
     rpe,
     trajectory_metrics,
-    transform_poses,
-    write_tum,
 )
 from warpslam.evaluation.virtual_views import VirtualDepth, virtual_depth
+from warpslam.poses import transform_poses
+from warpslam.storage.tum import associate, read_tum, write_tum
 
 __all__ = [
     "DEFAULT_PROTOCOL",

@@ -23,7 +23,7 @@ import numpy as np
 
 from warpslam.errors import InputError, MeshError
 from warpslam.evaluation.culling import SAMPLE_COUNT, Culling, sample_surface
-from warpslam.evaluation.trajectory import align_horn
+from warpslam.evaluation.trajectory_errors import align_horn
 
 if TYPE_CHECKING:
     import trimesh

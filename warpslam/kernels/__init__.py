@@ -2,5 +2,5 @@
 
 The stages of one optimisation iteration, in order: `rays` (pixels, rays, samples), `decoder` (grid lookup and MLPs),
 `compositing`, `losses`, `adam`. `frustum` and `grid` serve the map. Arrays of one iteration live in
-`warpslam.field.RayBatch`, which also records the iteration on a `wp.Tape`.
+`warpslam.field.ray_batch.RayBatch`, which also records the iteration on a `wp.Tape`.
 """

@@ -909,8 +909,7 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         selected: wp.array(dtype=wp.uint8),
         grid_grad: wp.array2d(dtype=Vec32),
     ):
-        """Adjoint of `coarse_forward`; the coarse level serves mapping only, so the sample position gets no gradient.
-        """
+        """Adjoint of `coarse_forward`; the coarse level serves mapping only: the position gets no gradient."""
         thread = wp.tid()
         count = listed_count[count_index(slot)]
         if size * thread >= count:
@@ -1026,3 +1025,8 @@ def decoder_kernels(target: str) -> SimpleNamespace:
 
 CPU = decoder_kernels("cpu")
 CUDA = decoder_kernels("cuda")
+
+
+def decoders_for(device: wp.Device) -> SimpleNamespace:
+    """The decoder kernels built for this kind of device."""
+    return CUDA if device.is_cuda else CPU

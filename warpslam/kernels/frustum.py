@@ -1,6 +1,6 @@
 """Frustum feature selection (A.1, Sec. 3.3): which vertices of a grid the current frame may change.
 
-`mark_seen` and `start_from_depth` are ours: see `RayBatch.drop_unseen` and `warpslam.depth_start`.
+`mark_seen` and `start_from_depth` are ours: see `RayBatch.drop_unseen` and `warpslam.mapping.depth_start`.
 
 A vertex is selected if it projects inside the image and lies in front of the camera, no deeper than 0.5 m behind the
 measured surface
@@ -44,8 +44,7 @@ def project_vertices(
     vertex_depth: wp.array(dtype=float),
     max_depth: wp.array(dtype=float),
 ):
-    """First pass: depth of the vertex (-1 where it does not project inside the image) and measured depth at its pixel.
-    """
+    """First pass: depth of the vertex (-1 where it projects outside the image) and measured depth at its pixel."""
     i, j, k = wp.tid()
     row = row_of(lattice, i, j, k)
     p = vertex_position(lattice, i, j, k)

@@ -69,9 +69,7 @@ def ray_derivatives(
                 alpha = occupancy(logit[i])
                 free = 1.0 - alpha
                 blocked = alpha / (free + 1.0e-10)
-                derivatives = (
-                    10.0 * free * wp.vec2(z[i] * w - blocked * depth_behind, grey * w - blocked * grey_behind)
-                )
+                derivatives = 10.0 * free * wp.vec2(z[i] * w - blocked * depth_behind, grey * w - blocked * grey_behind)
                 want = wp.where(wp.max(wp.abs(derivatives[0]), wp.abs(derivatives[1])) > min_gradient, 1.0, 0.0)
             depth_behind += z[i] * w
             grey_behind += grey * w

@@ -41,9 +41,7 @@ def pixel_direction(u: int, v: int, focal: wp.vec2, center: wp.vec2) -> wp.vec3:
 @wp.func
 def nearest_pixel(q: wp.vec3, focal: wp.vec2, center: wp.vec2) -> wp.vec2i:
     """The pixel that a point in front of the camera, in its coordinates, falls on; it may lie outside the image."""
-    return wp.vec2i(
-        int(wp.rint(focal[0] * q[0] / q[2] + center[0])), int(wp.rint(focal[1] * q[1] / q[2] + center[1]))
-    )
+    return wp.vec2i(int(wp.rint(focal[0] * q[0] / q[2] + center[0])), int(wp.rint(focal[1] * q[1] / q[2] + center[1])))
 
 
 @wp.func

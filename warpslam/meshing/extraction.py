@@ -26,7 +26,7 @@ from warpslam.errors import InputError, MeshError
 from warpslam.meshing.cleaning import Hull, face_vectors, keep_faces, piece_areas, vertex_normals
 from warpslam.meshing.marching_cubes import Surface, all_corners, touched_points
 from warpslam.meshing.views import Evidence, ObservedView
-from warpslam.profiling import phase
+from warpslam.runtime.phases import phase
 
 UNOBSERVED_LOGIT = -100.0
 # What an observed point farther than the band from every surface holds: free, without asking the field.

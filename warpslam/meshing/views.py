@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpslam.camera import Intrinsics, check_transform
+from warpslam.camera import Intrinsics
 from warpslam.errors import InputError, MeshError
+from warpslam.poses import check_transform
 
 # The reference enlarges images by 1000 px; in focal lengths of its Replica camera (600 px), as images have many sizes.
 REACH_MARGIN = 1000.0 / 600.0

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from warpslam.profiling.phases import phase as phase
+from warpslam.runtime.phases import phase as phase
 
 if TYPE_CHECKING:
     from warpslam.profiling.recorder import Profile

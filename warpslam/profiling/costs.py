@@ -1,6 +1,6 @@
 """What a kernel launch computes and moves: points, floating-point operations, bytes.
 
-Operations are counted as `warpslam.complexity` counts them, two a weight and one a bias; the embedding's p B,
+Operations are counted as `warpslam.field.complexity` counts them, two a weight and one a bias; the embedding's p B,
 sines, interpolation and compositing are left out, so that rates are a little too low rather than too high. An adjoint
 costs two operations a weight for the derivative by its inputs, and two for the derivative by the weights.
 
@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpslam.complexity import decoder_shapes, flops_per_point
-from warpslam.decoders import EMBEDDING_SIZE, FEATURE_SIZE, MAX_HIDDEN
+from warpslam.field.complexity import decoder_shapes, flops_per_point
+from warpslam.field.decoders import EMBEDDING_SIZE, FEATURE_SIZE, MAX_HIDDEN
 
 ROW_BYTES = 4 * FEATURE_SIZE
 

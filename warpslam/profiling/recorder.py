@@ -19,7 +19,6 @@ from collections import defaultdict, deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,57 +26,18 @@ import numpy as np
 import warp as wp
 import warp._src.context as warp_context
 
-from warpslam import launching
 from warpslam.errors import WarpSlamError
-from warpslam.profiling import phases
 from warpslam.profiling.costs import NOTHING, Arguments, Work, work_of
-from warpslam.profiling.phases import Span, clock
+from warpslam.profiling.records import GPU, Interval, Launch
+from warpslam.runtime import launching, phases
+from warpslam.runtime.phases import Span, clock
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from warpslam.profiling.report import Report
 
-GPU = 0
-"""Stands for a thread where a kernel ran on the device."""
 _PEAK_SIZE = 2048
-
-
-@dataclass(frozen=True, slots=True)
-class Launch:
-    """A kernel launch.
-
-    kernel: Name; " (adjoint)" for a generated adjoint.
-    path: Phase.
-    thread: Identity of the thread it ran on, or `GPU`.
-    own: Whether that is the thread that entered the phase.
-    start, stop: Of the kernel alone, by `phases.clock` [s]; on the GPU only their difference is measured.
-    """
-
-    kernel: str
-    path: str
-    thread: int
-    own: bool
-    start: float
-    stop: float
-    work: Work
-
-
-@dataclass(frozen=True, slots=True)
-class Interval:
-    """Time of a thread that went into something else than a kernel.
-
-    what: "launch" (preparing arguments), "wait" (for the other slices), "load" (of the module ``name``, compiling it if
-    need be), "profiler" (counting points).
-    """
-
-    what: str
-    path: str
-    thread: int
-    own: bool
-    start: float
-    seconds: float
-    name: str = ""
 
 
 class Profile:

@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warpslam.run_folder import to_json
+from warpslam.storage.json_files import to_json
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from warpslam.profiling.recorder import Launch, Profile
+    from warpslam.profiling.recorder import Profile
+    from warpslam.profiling.records import Launch
 
 
 @dataclass

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from warpslam.profiling.recorder import GPU
+from warpslam.profiling.records import GPU
 
 if TYPE_CHECKING:
     from warpslam.profiling.recorder import Profile

@@ -10,7 +10,7 @@ from warpslam.report.data import RunData as RunData
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from warpslam.run_folder import RunFolder
+    from warpslam.runs.folder import RunFolder
 
 
 def write_report(folder: RunFolder, output: str | Path | None = None) -> Path:

@@ -10,7 +10,7 @@ from warpslam.report import charts
 from warpslam.report.data import RunData
 from warpslam.report.page import Html, element, figures, join, missing, page, section, table, void, write_page
 from warpslam.report.text import centimetres, decibels, duration, megabytes, percent
-from warpslam.run_folder import RunFolder
+from warpslam.runs.folder import RunFolder
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warpslam.errors import DatasetError
-from warpslam.evaluation import AteResult, associate, ate, read_tum
-from warpslam.run_folder import RunFolder, Source, read_json
+from warpslam.evaluation import AteResult, ate
+from warpslam.runs.folder import RunFolder
+from warpslam.runs.request import Source
+from warpslam.storage.json_files import read_json
+from warpslam.storage.tum import associate, read_tum
 
 if TYPE_CHECKING:
-    from warpslam.plots import Panel
+    from warpslam.runs.panels import Panel
 
 SAME_TIME = 1e-6  # [s]
 
@@ -70,7 +73,7 @@ class RunData:
         Raises:
             DatasetError: A file is damaged.
         """
-        from warpslam.plots import load_panels
+        from warpslam.runs.panels import load_panels
 
         timestamps, poses = np.zeros(0), np.zeros((0, 4, 4))
         if folder.trajectory.is_file():
@@ -131,7 +134,7 @@ def upright_axes(poses: np.ndarray) -> np.ndarray:
     Up is the world axis nearest to the cameras' mean up, since people hold them upright; the seen plane is never
     mirrored.
     """
-    from warpslam.plots import top_view_axes
+    from warpslam.report.plots import top_view_axes
 
     right, away = (np.eye(3)[axis] for axis in top_view_axes(poses))
     up = np.cross(right, away)

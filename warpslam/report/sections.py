@@ -9,16 +9,10 @@ import numpy as np
 from warpslam.errors import MeshError
 from warpslam.evaluation import depth_l1
 from warpslam.report import charts
-from warpslam.report.accounts import (
-    frames_section,
-    memory_section,
-    settings_section,
-    timing_section,
-    versions_section,
-)
+from warpslam.report.accounts import frames_section, memory_section, settings_section, timing_section, versions_section
 from warpslam.report.data import RunData, axis_name, upright_axes
-from warpslam.report.images import MeshView, color_map, color_stops, data_uri, mesh_views
 from warpslam.report.page import Html, element, figures, join, legend, missing, page, section, table, void
+from warpslam.report.pictures import MeshView, color_map, color_stops, data_uri, mesh_views
 from warpslam.report.text import centimetres, decibels, duration, number, percent
 
 NO_TRUTH = "The sequence has no ground truth, so there is no error to measure."
@@ -289,7 +283,7 @@ def views_of(run: RunData, limit: int | None = None) -> list[MeshView]:
 
 
 def _mesh_figure(view: MeshView, first: bool) -> Html:
-    from warpslam.report.images import VIEW_HEIGHT, VIEW_WIDTH
+    from warpslam.report.pictures import VIEW_HEIGHT, VIEW_WIDTH
 
     picture = element("image", href=view.uri, width=VIEW_WIDTH, height=VIEW_HEIGHT)
     path = None

@@ -8,7 +8,7 @@ from pathlib import Path
 from warpslam.errors import DatasetError
 from warpslam.sequences.calibration import Calibration, find_calibration, has_own_camera
 from warpslam.sequences.files import FileSequence
-from warpslam.sequences.images import list_images
+from warpslam.sequences.image_files import list_images
 from warpslam.sequences.redwood import find_log_poses
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from warpslam.sequences.calibration import find_calibration
 from warpslam.sequences.files import FileSequence
-from warpslam.sequences.images import list_images, read_exr
+from warpslam.sequences.image_files import list_images, read_exr
 
 # The renderer writes about 1e10 where a ray leaves the scene.
 _MAX_DEPTH = 1e3

@@ -13,7 +13,7 @@ import numpy as np
 from warpslam.errors import DatasetError
 from warpslam.sequences.base import Frame, RgbdSequence
 from warpslam.sequences.calibration import Calibration
-from warpslam.sequences.images import read_depth, read_rgb
+from warpslam.sequences.image_files import read_depth, read_rgb
 
 FRAME_RATE = 30.0
 _FIRST_FRAMES = 10

@@ -9,8 +9,8 @@ import numpy as np
 
 from warpslam.sequences.calibration import find_calibration
 from warpslam.sequences.files import FileSequence
-from warpslam.sequences.images import list_images, natural_key
-from warpslam.sequences.poses import read_redwood_log
+from warpslam.sequences.image_files import list_images, natural_key
+from warpslam.sequences.pose_files import read_redwood_log
 
 
 class RedwoodSequence(FileSequence):

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from warpslam.sequences.calibration import find_calibration
 from warpslam.sequences.files import FileSequence, check_partners
-from warpslam.sequences.images import list_images
-from warpslam.sequences.poses import read_matrix_lines
+from warpslam.sequences.image_files import list_images
+from warpslam.sequences.pose_files import read_matrix_lines
 
 
 class ReplicaSequence(FileSequence):

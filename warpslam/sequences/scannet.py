@@ -9,8 +9,8 @@ import numpy as np
 from warpslam.errors import DatasetError
 from warpslam.sequences.calibration import find_calibration
 from warpslam.sequences.files import FileSequence, check_partners
-from warpslam.sequences.images import list_images
-from warpslam.sequences.poses import read_matrix_file
+from warpslam.sequences.image_files import list_images
+from warpslam.sequences.pose_files import read_matrix_file
 
 
 class ScanNetSequence(FileSequence):

@@ -11,7 +11,7 @@ import numpy as np
 from warpslam.errors import DatasetError
 from warpslam.sequences.calibration import find_calibration
 from warpslam.sequences.files import FileSequence
-from warpslam.sequences.poses import read_lines, read_tum_poses
+from warpslam.sequences.pose_files import read_lines, read_tum_poses
 
 MAX_TIME_DIFFERENCE = 0.08
 """Colour, depth and pose of a frame lie within this time [s] of each other."""

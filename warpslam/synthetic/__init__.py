@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from warpslam.synthetic.contact_sheet import contact_sheet
+from warpslam.synthetic.__main__ import contact_sheet
+from warpslam.synthetic.camera_path import look_at, orbit, room_trajectory, walk
 from warpslam.synthetic.export import SEQUENCE_KINDS, make_sequence, write_sequence
 from warpslam.synthetic.gap import GapSequence
 from warpslam.synthetic.moving import MovingObjectSequence
@@ -10,7 +11,6 @@ from warpslam.synthetic.noise import sensor_noise
 from warpslam.synthetic.render import MeshRenderer, load_mesh
 from warpslam.synthetic.rooms import Room, make_room
 from warpslam.synthetic.sequence import RenderedSequence, SyntheticSequence, write_replica
-from warpslam.synthetic.trajectory import look_at, orbit, room_trajectory, walk
 
 __all__ = [
     "SEQUENCE_KINDS",

@@ -7,10 +7,10 @@ import numpy as np
 from warpslam.camera import Intrinsics
 from warpslam.errors import InputError
 from warpslam.sequences.base import Frame
+from warpslam.synthetic.camera_path import room_trajectory
 from warpslam.synthetic.render import MeshRenderer
 from warpslam.synthetic.rooms import make_room
 from warpslam.synthetic.sequence import DEFAULT_INTRINSICS, FRAME_RATE, RenderedSequence
-from warpslam.synthetic.trajectory import room_trajectory
 
 GAP_KINDS = ("absent", "black")
 

@@ -9,12 +9,12 @@ import numpy as np
 from warpslam.camera import Intrinsics
 from warpslam.errors import InputError
 from warpslam.sequences.base import Frame
+from warpslam.synthetic.camera_path import room_trajectory
 from warpslam.synthetic.furniture import Piece, box_stack, chair, plant
 from warpslam.synthetic.render import MeshRenderer
 from warpslam.synthetic.rooms import Room, make_room
 from warpslam.synthetic.sequence import DEFAULT_INTRINSICS, RenderedSequence
 from warpslam.synthetic.solids import yaw_rotation
-from warpslam.synthetic.trajectory import room_trajectory
 
 if TYPE_CHECKING:
     import trimesh

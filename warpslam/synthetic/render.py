@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warpslam.camera import Intrinsics, check_transform
+from warpslam.camera import Intrinsics
 from warpslam.errors import ConfigError, MeshError
+from warpslam.poses import check_transform
 
 if TYPE_CHECKING:
     import trimesh
@@ -170,7 +171,7 @@ class MeshRenderer:
         """
         import warp as wp
 
-        from warpslam.synthetic.raycast import render_mesh
+        from warpslam.kernels.raycast import render_mesh
 
         T = check_transform(T_world_camera)
         k = self.intrinsics

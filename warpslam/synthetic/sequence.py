@@ -10,10 +10,10 @@ import numpy as np
 from warpslam.camera import Intrinsics
 from warpslam.errors import DatasetError, InputError
 from warpslam.sequences.base import Frame, RgbdSequence
+from warpslam.synthetic.camera_path import room_trajectory
 from warpslam.synthetic.noise import sensor_noise
 from warpslam.synthetic.render import MeshRenderer
 from warpslam.synthetic.rooms import make_room
-from warpslam.synthetic.trajectory import room_trajectory
 
 DEFAULT_INTRINSICS = Intrinsics(fx=250.0, fy=250.0, cx=159.5, cy=119.5, width=320, height=240)
 REPLICA_DEPTH_SCALE = 6553.5
@@ -27,7 +27,7 @@ class RenderedSequence(RgbdSequence):
     warp_modules: Modules of kernels that rendering needs, beside those of SLAM.
     """
 
-    warp_modules = ("warpslam.synthetic.raycast",)
+    warp_modules = ("warpslam.kernels.raycast",)
 
     def __init__(self, name: str, renderer: MeshRenderer, poses: np.ndarray, *, noise_seed: int | None = None) -> None:
         self.name = name

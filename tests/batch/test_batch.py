@@ -1,0 +1,330 @@
+"""Many sequences in worker processes: states, what is skipped and what is done again, and how workers end."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.fakes import Terminal
+from warpslam import cli
+from warpslam.batch import local as batch
+from warpslam.batch.jobs import Job, with_free_names
+from warpslam.batch.local import run_batch, split_cores
+from warpslam.batch.manifest import FIELDS, read_manifest
+from warpslam.batch.status import BatchState, JobStatus
+from warpslam.batch.summary import write_summary
+from warpslam.errors import ConfigError, WarpSlamError
+from warpslam.runtime.environment import resident_bytes
+from warpslam.storage.json_files import read_json
+
+COMMON = Job(name="", path="")
+
+
+@pytest.fixture(autouse=True)
+def fake_worker(monkeypatch):
+    """Workers that need no SLAM."""
+    worker = str(Path(__file__).with_name("fake_worker.py"))
+    monkeypatch.setattr(batch, "WORKER_COMMAND", (sys.executable, worker))
+
+
+def jobs(*names: str) -> list[Job]:
+    return with_free_names(Job(name=name, path=f"/data/{name}") for name in names)
+
+
+def test_failures_do_not_stop_the_rest(tmp_path):
+    """Every way to end is told, with its reason; the others finish."""
+    names = ("good", "broken", "bug", "killed", "exits", "good2")
+    statuses = {status.name: status for status in run_batch(jobs(*names), tmp_path, workers=2)}
+    assert list(statuses) == list(names)
+    assert {name: status.status for name, status in statuses.items()} == {
+        "good": "finished", "broken": "failed", "bug": "failed", "killed": "crashed", "exits": "crashed",
+        "good2": "finished",
+    }  # fmt: skip
+    assert statuses["broken"].message.startswith("depth.png: truncated")
+    assert statuses["bug"].message == "ZeroDivisionError: by zero"
+    assert "SIGKILL" in statuses["killed"].message
+    assert statuses["exits"].message == "the worker ended with code 3: last words"
+    good = statuses["good"]
+    assert (good.done, good.total, good.ate_rmse, good.fps, good.lost) == (4, 4, 0.03, 2.0, 1) and good.seconds > 0
+
+
+def test_running_again_does_only_what_is_left(tmp_path):
+    """Finished jobs are not touched; failed ones, and those with other settings, are run again."""
+    first = jobs("good", "broken", "other")
+    run_batch(first, tmp_path, workers=2)
+    before = {job.name: read_json(tmp_path / job.name / "batch.json") for job in first}
+    again = [first[0], first[1], replace(first[2], seed=1)]
+    statuses = run_batch(again, tmp_path)
+    assert [status.status for status in statuses] == ["done before", "failed", "finished"]
+    assert statuses[0].ate_rmse == 0.03
+    after = {job.name: read_json(tmp_path / job.name / "batch.json") for job in first}
+    assert after["good"] == before["good"]
+    assert after["broken"]["pid"] != before["broken"]["pid"] and after["other"]["pid"] != before["other"]["pid"]
+    (tmp_path / "good" / "trajectory.tum").unlink()
+    assert run_batch(first[:1], tmp_path)[0].status == "finished"
+
+
+def test_memory_budget(tmp_path):
+    """A worker beyond its budget ends with a clear status; far beyond it, at once. Neither stops the rest."""
+    base = 0.001 * round(resident_bytes() / 1e6)
+    assert 0.01 < base < 10
+    soft, hard = 0.16, 0.08
+    for budget, is_soft in ((soft, True), (hard, False)):
+        folder = tmp_path / str(budget)
+        hungry, good = run_batch(jobs("hungry", "good"), folder, workers=2, memory_gb=budget)
+        assert (hungry.status, good.status) == ("out of memory", "finished")
+        assert f"exceed the budget of {budget:g} GB" in hungry.message and "--memory-gb" in hungry.message
+        assert ("ending" in BatchState.of(jobs("hungry")[0], folder).fields) != is_soft
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system does not pin processes to cores")
+def test_workers_share_the_cores(tmp_path, monkeypatch):
+    """Each worker is pinned to its share, disjoint where there are enough cores."""
+    run_batch(jobs("slow1", "slow2"), tmp_path, workers=2)
+    own = sorted(os.sched_getaffinity(0))
+    shares = [eval((tmp_path / name / "cores.txt").read_text()) for name in ("slow1", "slow2")]
+    assert sorted(sum(shares, [])) == own if len(own) > 1 else shares == [own, own]
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 4, 5, 6})
+    assert split_cores(2) == [[0, 1], [4, 5, 6]]
+    assert split_cores(5) == [[0], [1], [4], [5], [6]]
+    assert split_cores(6)[5] == [0]
+
+
+def test_updates_tell_the_story(tmp_path):
+    """Waiting, running with frames, and the end, for each job."""
+    seen: list[JobStatus] = []
+    run_batch(jobs("slow", "good"), tmp_path, on_update=seen.append)
+    story = [status.status for status in seen if status.name == "slow"]
+    assert story[0] == "waiting" and story[1] == "running" and story[-1] == "finished"
+    assert {status.done for status in seen if status.name == "slow"} >= {1, 2, 3, 4}
+
+
+def test_kernels_are_compiled_once(tmp_path):
+    """The second worker starts when the first one has all kernels, not while it compiles them."""
+    running = {}
+    names = ("compiling", "good", "good2")
+    run_batch(
+        jobs(*names), tmp_path, workers=2,
+        on_update=lambda status: status.status == "running" and running.setdefault(status.name, time.monotonic()),
+    )  # fmt: skip
+    assert running["good"] - running["compiling"] > 0.5 > running["good2"] - running["good"]
+
+
+@pytest.fixture
+def heard_interrupts():
+    """Ctrl-C arrives, also where the tests were started in the background of a shell, which has it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_interrupt_stops_workers_and_the_rest_waits(tmp_path, heard_interrupts):
+    """Ctrl-C: the running job is told to write what it has, the next one is not started, and both go on later."""
+    sent = []
+
+    def on_update(status):
+        if status.done == 1 and not sent:
+            sent.append(True)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    statuses = run_batch(jobs("slow", "next"), tmp_path, on_update=on_update)
+    assert [status.status for status in statuses] == ["interrupted", "interrupted"]
+    assert statuses[1].message == "not started"
+    assert [status.status for status in run_batch(jobs("slow", "next"), tmp_path)] == ["finished", "finished"]
+
+
+def test_worker_left_behind_is_no_obstacle(tmp_path):
+    """A state file that still says "running" (the machine was switched off) means that the job is run again."""
+    (job,) = jobs("good")
+    BatchState.of(job, tmp_path).write(settings=job.settings_hash, status="running", attempt=1)
+    (status,) = run_batch([job], tmp_path)
+    assert (status.status, status.attempt) == ("finished", 2)
+    (tmp_path / "good" / "batch.json").write_text("{")
+    assert run_batch([job], tmp_path)[0].status == "finished"
+
+
+def test_manifest(tmp_path):
+    """Defaults, entries as text and as mapping, paths relative to the file, names made unique."""
+    text = """
+    defaults: {preset: replica, set: [mapping.every=2], seed: 3}
+    sequences:
+      - room
+      - {path: a/room, set: [mapping.window=4], frames: "0:200", device: cpu, truth_mesh: a/m.ply}
+      - {path: /x/y, name: last one}
+    """
+    file = tmp_path / "batch.yaml"
+    file.write_text(text)
+    first, second, third = with_free_names(read_manifest(file, COMMON))
+    assert (first.name, second.name, third.name) == ("room", "room_2", "last_one")
+    assert first.path == str(tmp_path / "room") and third.path == "/x/y"
+    assert second.overrides == ("mapping.every=2", "mapping.window=4") and second.frames == (0, 200, None)
+    assert second.truth_mesh == str(tmp_path / "a" / "m.ply") and (second.seed, second.preset) == (3, "replica")
+    assert len({job.settings_hash for job in (first, second, third)}) == 3
+    assert Job.from_dict(second.to_dict()) == second
+
+
+def test_manifest_names_methods_poses_and_checkpoints(tmp_path):
+    """Method, given poses (relative to the file) and checkpoints, of all sequences or of one; 0 is for none."""
+    text = """
+    defaults: {method: tsdf, poses: poses.tum, checkpoint_every: 7}
+    sequences: [a, {path: b, method: nice-slam, checkpoint_every: 0}]
+    """
+    (tmp_path / "m.yaml").write_text(text)
+    first, second = read_manifest(tmp_path / "m.yaml", replace(COMMON, checkpoint_every=50))
+    assert (first.method, first.poses, first.checkpoint_every) == ("tsdf", str(tmp_path / "poses.tum"), 7)
+    assert (second.method, second.checkpoint_every) == ("nice-slam", None)
+
+
+def test_checkpoints_do_not_decide_on_the_result():
+    """A batch with other checkpoints is still the same batch; one with another method or other poses is not."""
+    job = Job("a", "/a")
+    assert replace(job, checkpoint_every=5).settings_hash == job.settings_hash
+    assert len({j.settings_hash for j in (job, replace(job, method="tsdf"), replace(job, poses="/p"))}) == 3
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "expected a list 'sequences'"),
+        ("sequences: []", "expected a list 'sequences'"),
+        ("sequences: [1]", "entry 1: expected a folder"),
+        ("sequences: [{name: a}]", "entry 1: expected"),
+        ("sequences: [a, {path: b, sed: 1}]", "entry 2: .*known fields are path"),
+        ("sequences: [{path: b, seed: x}]", "seed = 'x'"),
+        ("sequences: [{path: b, set: a=1}]", "set = 'a=1' must be a list"),
+        ("sequences:\n- path: b\n  frames: 1:20", "frames = 80 must be a text in quotes"),
+        ("sequences: [{path: b, frames: 'x'}]", "is not A:B"),
+        ("sequences: [a]\nextra: 1", "unknown field extra"),
+        ("a: b: c", "can't be read as yaml"),
+        ("[" * 3000, "can't be read as yaml"),
+    ],
+)
+def test_wrong_manifests(tmp_path, text, message):
+    """What is wrong is named with the file and the entry."""
+    (tmp_path / "m.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        read_manifest(tmp_path / "m.yaml", COMMON)
+
+
+@settings(deadline=None, derandomize=True)
+@given(st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3)
+    | st.dictionaries(st.sampled_from([*FIELDS, "sequences", "defaults", "x"]), inner, max_size=4),
+    max_leaves=12,
+))  # fmt: skip
+def test_any_manifest_is_read_or_refused(tmp_path_factory, content):
+    """Whatever yaml holds, the answer is jobs or a typed error."""
+    file = tmp_path_factory.mktemp("m") / "m.yaml"
+    file.write_text(yaml.safe_dump(content))
+    try:
+        assert all(isinstance(job.path, str) for job in with_free_names(read_manifest(file, COMMON)))
+    except WarpSlamError:
+        pass
+
+
+def test_settings_are_refused_before_any_worker_starts(tmp_path):
+    """A setting out of range, an unknown preset, no job at all."""
+    bad = [
+        ([replace(jobs("a")[0], overrides=("mapping.window=0",))], {}, "mapping.window"),
+        ([replace(jobs("a")[0], preset="fast")], {}, "preset 'fast'"),
+        ([jobs("b")[0], replace(jobs("a")[0], method="orb")], {}, "method 'orb' is unknown"),
+        ([replace(jobs("a")[0], checkpoint_every=-1)], {}, "checkpoint_every = -1 of a"),
+        ([], {}, "the batch is empty"),
+        (jobs("a"), {"workers": 0}, "workers = 0"),
+        (jobs("a"), {"memory_gb": 0.0}, "memory_gb"),
+    ]
+    for job_list, keywords, message in bad:
+        with pytest.raises(ConfigError, match=message):
+            run_batch(job_list, tmp_path / "out", **keywords)
+    assert not (tmp_path / "out").exists()
+
+
+def test_summary_files(tmp_path):
+    """A row a job; text from errors can't break the page."""
+    statuses = [
+        JobStatus("a", "finished", 4, 4, 0.0123, 2.5, 61.04, 1, 512.4, "", 2, 3),
+        JobStatus("b", "failed", message="<script>alert(1)</script>\nsecond line"),
+    ]
+    csv_path, html_path = write_summary(statuses, tmp_path)
+    rows = list(csv.reader(csv_path.open()))
+    assert rows[1][:2] == ["a", "finished (2 attempts, resumed after 3 frames)"]
+    assert rows[1][2:] == ["4/4", "1", "1.23", "2.50", "61.0", "512", ""]
+    assert rows[2][-1] == "<script>alert(1)</script>"
+    page = html_path.read_text()
+    assert "1 of 2 sequences done" in page and "<script>" not in page and "&lt;script&gt;" in page
+
+
+def test_command(tmp_path, capsys):
+    """Lines of progress, the table, both files; exit code 1 while something is unfinished, 0 after."""
+    for name in ("good", "broken"):
+        (tmp_path / name).mkdir()
+    out = tmp_path / "out"
+    options = ["--workers", "2", "-o", str(out)]
+    assert cli.main(["batch", str(tmp_path / "good"), str(tmp_path / "broken"), *options]) == 1
+    text = capsys.readouterr().out
+    assert "good: running  frame 4/4  2.00 fps" in text
+    assert "broken: failed  frame 2/4  2.00 fps  ATE 1.00 cm  depth.png: truncated" in text
+    assert "sequence" in text and "3.00" in text and str(out / "summary.html") in text
+    assert cli.main(["batch", str(tmp_path / "good"), *options]) == 0
+    assert "good: done before" in capsys.readouterr().out
+    assert (out / "summary.csv").is_file()
+
+
+@pytest.mark.parametrize(
+    ("options", "method", "every"),
+    [
+        ([], "nice-slam", 50),
+        (["--checkpoint-every", "7", "--method", "imap"], "imap", 7),
+        (["--checkpoint-every", "0"], "nice-slam", None),
+    ],
+)
+def test_command_names_method_and_checkpoints(tmp_path, monkeypatch, options, method, every):
+    """Checkpoints are written unless they are switched off, and the method is the option's."""
+    found = []
+    monkeypatch.setattr(batch, "run_batch", lambda jobs, output, **keywords: found.extend(jobs) or [])
+    assert cli.main(["batch", str(tmp_path), "-o", str(tmp_path / "out"), *options]) == 0
+    assert [(job.method, job.checkpoint_every) for job in found] == [(method, every)]
+
+
+def test_table_on_a_terminal(tmp_path, monkeypatch):
+    """On a terminal a table is kept up to date, and ends as the summary."""
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stdout", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "150")
+    assert cli.main(["batch", str(tmp_path / "slow"), "-o", str(tmp_path / "out")]) == 0
+    text = terminal.getvalue()
+    assert "running" in text and "finished" in text and "3.00" in text
+
+
+def test_dead_coordinator_takes_its_workers_along(tmp_path):
+    """A worker whose reader is gone ends instead of going on unseen."""
+    import json
+    import subprocess
+
+    (job,) = jobs("slow")
+    order = {"job": job.to_dict(), "output": str(tmp_path), "slot": 0, "cores": split_cores(1)[0], "memory_gb": None}
+    environment = {**os.environ, "PYTHONPATH": str(Path(batch.__file__).parent.parent)}
+    (tmp_path / "slow").mkdir()
+    process = subprocess.Popen(
+        batch.WORKER_COMMAND, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+        env=environment, text=True,
+    )  # fmt: skip
+    process.stdin.write(json.dumps(order))
+    process.stdin.close()
+    process.stdout.readline()
+    process.stdout.close()
+    start = time.monotonic()
+    process.wait(timeout=20)
+    assert time.monotonic() - start < 20 and not (tmp_path / "slow" / "metrics.json").exists()

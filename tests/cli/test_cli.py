@@ -1,0 +1,280 @@
+"""The command line: arguments, what is printed, exit codes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.fakes import FakeSequence, FakeSlam, Terminal, wall
+from warpslam import cli
+from warpslam.cli.common import parse_frames
+from warpslam.pipeline import finished as revisit
+from warpslam.pipeline import run as pipeline
+from warpslam.storage.json_files import read_json
+from warpslam.storage.tum import read_tum
+from warpslam.synthetic import demo
+
+
+@pytest.fixture
+def faked(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
+    """Sequences and SLAM that answer at once, behind the real command line; plots and reports are left out."""
+
+    class Slam(FakeSlam):
+        configs: list = []
+
+    def build(intrinsics, config, device, seed):
+        Slam.configs.append(config)
+        return Slam(intrinsics, config=config, device=device, seed=seed)
+
+    monkeypatch.setattr(pipeline, "build_slam", build)
+    monkeypatch.setattr(pipeline._Run, "_draw_plots", lambda self: None)
+    monkeypatch.setattr(pipeline._Run, "_write_report", lambda self: None)
+    monkeypatch.setattr(revisit, "load_slam", lambda folder, device=None: Slam.load(folder.map, device))
+    monkeypatch.setattr(revisit, "open_source", lambda source: FakeSequence(8, unreadable=(6,)))
+    return Slam
+
+
+def test_run_prints_progress_and_summary(faked, tmp_path, capsys):
+    """Plain lines where there is no terminal, then the figures and where everything lies; warnings on stderr."""
+    assert cli.main(["run", "seq", "--frames", "0:7", "--seed", "5", "-o", str(tmp_path / "out")]) == 0
+    out, err = capsys.readouterr()
+    assert "frame 1/7" in out and "frame 7/7" not in out  # frame 6 can't be read
+    metrics = read_json(tmp_path / "out" / "metrics.json")
+    errors = [f"{100 * metrics['ate_m'][how]['rmse']:.2f} cm {how}" for how in ("aligned", "unaligned")]
+    assert f"ATE RMSE    {', '.join(errors)}" in out and "6 of 7 (6 OK, 1 unreadable), finished" in out
+    assert f"written to  {tmp_path / 'out'}" in out
+    assert "WARNING: frame 6 left out" in err
+    assert metrics["seed"] == 5
+
+
+def test_run_passes_settings_on(faked, tmp_path):
+    """Preset, overrides and the decoder file reach the configuration that is used and written."""
+    arguments = ["run", "seq", "--preset", "paper_scannet", "--set", "mapping.window=3", "tracking.iterations=7"]
+    arguments += ["--set", "mapping.every=2", "--decoders", "some.pth", "-o", str(tmp_path)]
+    assert cli.main(arguments) == 0
+    config = faked.configs[-1]
+    assert (config.mapping.window, config.tracking.iterations, config.mapping.every) == (3, 7, 2)
+    assert (config.tracking.pixels, config.decoders) == (1000, "some.pth")
+    assert "decoders: some.pth" in (tmp_path / "config.yaml").read_text()
+
+
+def test_run_records_how_to_open_the_input_again(faked, tmp_path):
+    """The folder is kept as an absolute path, with the format and camera given."""
+    cli.main(["run", "seq", "--dataset", "icl", "--camera", "1,1,1,1,2,2,1000", "-o", str(tmp_path)])
+    source = read_json(tmp_path / "input.json")
+    assert source["path"].startswith("/") and source["path"].endswith("seq")
+    assert (source["dataset"], source["camera"]) == ("icl", "1,1,1,1,2,2,1000")
+    assert source["command"] == f"warpslam run seq --dataset icl --camera 1,1,1,1,2,2,1000 -o {tmp_path}"
+
+
+def test_report_of_one_run_and_of_several(faked, tmp_path, monkeypatch, capsys):
+    """One run: its report, in its folder or where it is told to. Several: a comparison."""
+    for name in ("a", "b"):
+        cli.main(["run", "seq", "--frames", "0:3", "-o", str(tmp_path / name)])
+    monkeypatch.setattr("warpslam.report.pictures.SUPERSAMPLING", 1)
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+    for arguments in (["a"], ["a", "-o", "other.html"], ["a", "b"]):
+        assert cli.main(["report", *arguments]) == 0
+    assert capsys.readouterr().out.split() == ["a/report.html", "other.html", "comparison.html"]
+    assert "<h1>2 runs</h1>" in (tmp_path / "comparison.html").read_text()
+    assert (tmp_path / "a/report.html").read_text() == (tmp_path / "other.html").read_text()
+    assert cli.main(["report", "a", "nowhere"]) == 2
+
+
+def test_method_and_poses_are_passed_on(faked, tmp_path, capsys, monkeypatch):
+    """--method reaches the run; --poses gives an earlier run's trajectory, which is then not tracked again."""
+    assert cli.main(["run", "seq", "--frames", "0:4", "-o", str(tmp_path / "a")]) == 0
+    assert not faked.configs[-1].tracking.use_given_poses
+    assert "map         2.50 MB, 102,598 FLOP a point" in capsys.readouterr().out
+    poses = str(tmp_path / "a" / "trajectory.tum")
+    assert cli.main(["run", "seq", "--frames", "0:4", "--poses", poses, "-o", str(tmp_path / "b")]) == 0
+    assert faked.configs[-1].tracking.use_given_poses
+    assert read_json(tmp_path / "b" / "metrics.json")["poses"] == poses
+    methods = []
+
+    def build(method, intrinsics, config, device, seed):
+        methods.append(method)
+        return faked(intrinsics, config=config)
+
+    monkeypatch.setattr(pipeline, "build_baseline", build)
+    assert cli.main(["run", "seq", "--method", "tsdf", "--frames", "0:4", "-o", str(tmp_path / "c")]) == 0
+    assert methods == ["tsdf"] and read_json(tmp_path / "c" / "metrics.json")["method"] == "tsdf"
+
+
+def test_interrupted_run_exits_130_with_partial_results(faked, tmp_path, monkeypatch):
+    """Ctrl-C ends in the usual exit code and a run folder that can be used."""
+    monkeypatch.setattr(faked, "interrupt_at", 3)
+    assert cli.main(["run", "seq", "-o", str(tmp_path)]) == 130
+    assert len(read_tum(tmp_path / "trajectory.tum")[0]) == 3
+    assert cli.main(["eval", str(tmp_path)]) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run", "/no/such/folder"], "/no/such/folder"),
+        (["eval", "/no/such/run"], "/no/such/run"),
+        (["render", "/no/such/run", "--frame", "0"], "/no/such/run"),
+        (["mesh", "/no/such/run"], "/no/such/run"),
+        (["report", "/no/such/run"], "/no/such/run"),
+        (["demo", "--set", "mapping.windw=3"], "mapping.windw"),
+        (["demo", "--set", "mapping"], "mapping"),
+        (["demo", "--device", "cuda:77"], "cuda:77"),
+        (["profile", "demo", "--frames", "0:2", "--device", "cuda:77"], "cuda:77"),
+        (["profile", "demo", "--json", "/no/such/folder/p.json"], "/no/such/folder"),
+    ],
+)
+def test_errors_are_one_line_and_exit_2(arguments, message, tmp_path, capsys):
+    """What the user can put right is one clear line on stderr, without a traceback."""
+    extra = ["-o", str(tmp_path)] if arguments[0] == "demo" else []
+    assert cli.main([*arguments, *extra]) == 2
+    err = capsys.readouterr().err
+    assert err.startswith("warpslam: ") and message in err
+    assert "Traceback" not in err and len(err.strip().splitlines()) == 1
+
+
+def test_debug_shows_the_traceback():
+    """With --debug the exception comes through."""
+    from warpslam.errors import DatasetError
+
+    with pytest.raises(DatasetError):
+        cli.main(["eval", "/no/such/run", "--debug"])
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["fly"], ["run"], ["run", "x", "--frames", "5"], ["run", "x", "--frames", "a:b"], ["render", "x"]]
+)
+def test_wrong_arguments_exit_2(arguments, capsys):
+    """A command line that can't be parsed prints its usage."""
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(arguments)
+    assert exit_.value.code == 2
+    assert "usage:" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("0:200", slice(0, 200)), ("::2", slice(None, None, 2)), ("5:", slice(5, None)), (":-1:3", slice(None, -1, 3))],
+)
+def test_frames_are_a_python_slice(text, expected):
+    """A:B:STEP with any part left out."""
+    assert parse_frames(text) == expected
+
+
+def test_eval_prints_figures(faked, tmp_path, capsys):
+    """RMSE aligned and unaligned in cm, RPE, and how many frames were compared; --json gives the same as JSON."""
+    import json
+
+    run = str(tmp_path / "run")
+    cli.main(["run", "seq", "-o", run])
+    capsys.readouterr()
+    assert cli.main(["eval", run]) == 0
+    out = capsys.readouterr().out
+    rmse = 100 * read_json(tmp_path / "run" / "metrics.json")["ate_m"]["unaligned"]["rmse"]
+    assert f"ATE unaligned    RMSE {rmse:.3f} cm" in out and "7 of 7 compared" in out
+    assert cli.main(["eval", run, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ate_m"]["unaligned"]["rmse"] == pytest.approx(rmse / 100, abs=5e-9)
+
+
+def test_eval_compares_the_mesh(faked, small_evaluation, tmp_path, capsys):
+    """With a true surface a table names the protocol; --protocol all has a line for each, --views the renderings."""
+    run = str(tmp_path / "run")
+    cli.main(["run", "seq", "-o", run, "--frames", "0:3"])
+    wall().export(tmp_path / "wall.ply")
+    capsys.readouterr()
+    assert cli.main(["eval", run, "--truth-mesh", str(tmp_path / "wall.ply"), "--views", "1"]) == 0
+    out = capsys.readouterr().out
+    (line,) = (line for line in out.splitlines() if line.startswith("frustum"))
+    assert line.split()[0] == "frustum+occlusion" and "100.00 %" in line
+    assert "SSIM" in out and "1 frames" in out
+    assert cli.main(["eval", run, "--gt-mesh", str(tmp_path / "wall.ply"), "--protocol", "all"]) == 0
+    names = [line.split()[0] for line in capsys.readouterr().out.splitlines() if line.startswith("frustum")]
+    assert names == ["frustum+occlusion", "frustum", "frustum+occlusion+virtual"]
+    assert cli.main(["eval", run, "--gt-mesh", str(tmp_path / "wall.ply"), "--protocol", "visible"]) == 2
+    assert "choose one of frustum," in capsys.readouterr().err
+
+
+def test_render_and_mesh_of_a_run(faked, tmp_path, capsys):
+    """Both write where they are told to and say so."""
+    run = str(tmp_path / "run")
+    cli.main(["run", "seq", "-o", run])
+    assert cli.main(["render", run, "--frame", "2", "-o", str(tmp_path / "two.png")]) == 0
+    assert cli.main(["mesh", run, "--voxel", "0.05", "-o", str(tmp_path / "m.ply")]) == 0
+    assert (tmp_path / "two.png").stat().st_size > 1000
+    assert f"{tmp_path / 'm.ply'}: 4 vertices, 2 faces\n" in capsys.readouterr().out
+    assert cli.main(["mesh", run, "--forecast", "--refine"]) == 0
+    out = capsys.readouterr().out
+    assert f"{tmp_path / 'run' / 'mesh_forecast.ply'}: 4 vertices, 2 faces, 1 of them forecast" in out
+
+
+def test_demo_runs_on_its_own_sequence(faked, small_evaluation, tmp_path, monkeypatch, capsys):
+    """The demo needs no data, prints ATE and surface accuracy, and its settings can be overridden."""
+
+    class Demo(FakeSequence):
+        name, mesh = "demo", wall()
+
+    monkeypatch.setattr(demo, "demo_sequence", lambda: Demo(4))
+    assert cli.main(["demo", "--set", "mapping.window=4", "-o", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "ATE RMSE" in out and "frustum+occlusion" in out
+    assert faked.configs[-1].mapping.window == 4
+    assert read_json(tmp_path / "input.json")["path"] is None
+
+
+def test_demo_sequence_is_small_and_exact():
+    """The embedded sequence has depth, truth and a surface that agree: depth points lie on the mesh."""
+    sequence = demo.demo_sequence()
+    frame = sequence[demo.FRAME_COUNT // 2]
+    assert len(sequence) == demo.FRAME_COUNT and frame.depth.shape == (demo.INTRINSICS.height, demo.INTRINSICS.width)
+    v, u = np.nonzero(frame.depth)
+    keep = slice(None, None, max(1, len(u) // 20))
+    z, k = frame.depth[v, u][keep].astype(float), sequence.intrinsics
+    points = np.stack([(u[keep] - k.cx) / k.fx * z, (v[keep] - k.cy) / k.fy * z, z, np.ones_like(z)])
+    world = (frame.T_world_camera @ points)[:3].T
+    from trimesh.proximity import closest_point_naive
+
+    assert closest_point_naive(sequence.mesh, world)[1].max() < 0.01
+
+
+def test_info_names_versions_devices_and_decoders(capsys, tmp_path):
+    """One screen that a bug report needs, with the decoder file that is asked about."""
+    from warpslam.field.decoders import random_decoders
+
+    random_decoders().save(tmp_path / "d.pth")
+    assert cli.main(["info", "--decoders", str(tmp_path / "d.pth")]) == 0
+    out = capsys.readouterr().out
+    words = ["warpslam", "warp-lang", "torch", "cpu", "d.pth", "'coarse': 32", "replica", "tum_rgbd"]
+    words += ["40,961", "443,908"]
+    for word in words:
+        assert word in out, word
+
+
+@pytest.mark.parametrize("command", [module.__name__.rpartition(".")[2] for module in cli.COMMANDS])
+def test_each_command_explains_itself(command, capsys):
+    """``--help`` of every command can be formatted, and names its options."""
+    with pytest.raises(SystemExit) as exit_:
+        cli.main([{"evaluate": "eval"}.get(command, command), "--help"])
+    assert exit_.value.code == 0
+    assert "--debug" in capsys.readouterr().out
+
+
+def test_version(capsys):
+    """The version is that of the package."""
+    import warpslam
+
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["--version"])
+    assert exit_.value.code == 0
+    assert capsys.readouterr().out.strip() == f"warpslam {warpslam.__version__}"
+
+
+def test_progress_bar_on_a_terminal(monkeypatch, faked, tmp_path):
+    """On a terminal the rich bar is fed with the same figures and ends at the total."""
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stdout", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "160")
+    assert cli.main(["run", "seq", "--frames", "0:6", "-o", str(tmp_path)]) == 0
+    text = terminal.getvalue()
+    assert "fake sequence" in text and "6/6" in text and "ATE 0." in text and "fps" in text

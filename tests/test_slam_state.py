@@ -1,0 +1,222 @@
+"""Saved SLAM state: every field is needed and checked; the budget for keyframe images; memory figures."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from warpslam.camera import Intrinsics
+from warpslam.config import Config
+from warpslam.errors import CheckpointError, ConfigError, InputError, MapSizeError
+from warpslam.field.decoder_files import load_decoders
+from warpslam.slam import Slam
+from warpslam.slam_state import slam_from_state, slam_state
+from warpslam.synthetic import SyntheticSequence
+
+CAMERA = Intrinsics(40.0, 40.0, 23.5, 17.5, 48, 36)
+IMAGE_GIGABYTES = 5 * 48 * 36 / 1e9
+SETTINGS = [
+    "tracking.pixels=32", "tracking.iterations=2", "tracking.ignore_edge_u=2", "tracking.ignore_edge_v=2",
+    "tracking.lost_depth_error=10", "tracking.lost_inliers=0", "tracking.max_step=10", "tracking.max_turn=180",
+    "mapping.pixels=60", "mapping.every=2", "mapping.first_iterations=10", "mapping.iterations=5", "mapping.window=3",
+    "mapping.coarse_iterations=1", "mapping.refinement_rounds=1", "mapping.bundle_adjustment_keyframes=2",
+    "keyframes.every=1", "tracking.recovery_factor=1",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """Frames of a furnished room."""
+    sequence = SyntheticSequence(0, 10, intrinsics=CAMERA)
+    return [sequence[n] for n in range(10)]
+
+
+def run(frames, *overrides: str) -> Slam:
+    slam = Slam(CAMERA, Config.from_preset("default", [*SETTINGS, *overrides]), "cpu", decoders=load_decoders())
+    for frame in frames:
+        slam.step(frame.rgb, frame.depth, frame.timestamp)
+    return slam
+
+
+@pytest.fixture(scope="module")
+def state(frames):
+    """Header and arrays after four frames, one without depth and one that is lost."""
+    slam = run(frames[:3])
+    slam.step(frames[3].rgb, np.zeros_like(frames[3].depth))
+    slam.config.tracking.relocalization = False
+    noise = np.random.default_rng(0).uniform(0.3, 9.0, frames[4].depth.shape).astype(np.float32)
+    assert slam.step(frames[4].rgb, noise).status == "LOST"
+    return slam_state(slam)
+
+
+def test_everything_comes_back(state):
+    """The state of a loaded map is the state that was saved, to the last bit."""
+    header, arrays = state
+    again_header, again = slam_state(slam_from_state("map", header, arrays, "cpu"))
+    assert again_header == header and again.keys() == arrays.keys()
+    for name, array in arrays.items():
+        assert again[name].dtype == array.dtype, name
+        np.testing.assert_array_equal(again[name], array, err_msg=name)
+
+
+def test_frame_that_was_nowhere_can_be_saved(frames, tmp_path):
+    """A camera that could not be compared with anything has no depth error, and the state is saved as any other."""
+    slam = run(frames[:2])
+    slam.forget_pose()
+    slam.keyframes.clear()
+    result = slam.step(frames[2].rgb, frames[2].depth)
+    assert result.status == "LOST" and result.depth_error == np.inf and "no keyframe" in result.message
+    slam.save(tmp_path / "map.safetensors")
+    assert Slam.load(tmp_path / "map.safetensors", "cpu").trajectory.status == ["OK", "OK", "LOST"]
+
+
+def test_every_array_is_needed_and_checked(state):
+    """Each array left out, of another type, of another shape, or not finite is an error that names it."""
+    header, arrays = state
+    for name, array in arrays.items():
+        damaged = [None, array.astype(np.int8), array[None]]
+        if array.dtype.kind == "f" and array.size:
+            damaged.append(np.full_like(array, np.nan))
+        # (A full load for each of hundreds of decoder tensors would take long; they fail before it.)
+        for bad in damaged if not name.startswith("image_") else damaged[:2]:
+            others = {**arrays, name: bad} if bad is not None else {n: a for n, a in arrays.items() if n != name}
+            with pytest.raises(CheckpointError, match=name.split(":")[-1]):
+                slam_from_state("map", header, others, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("seed", -1), ("seed", "1"), ("config", None), ("config", {"grid": {"margin": -1}}), ("intrinsics", {"fx": 1}),
+        ("intrinsics", None), ("current", 99), ("mapped", "x"), ("first", None), ("keyframes", [77]),
+        ("keyframes", 3), ("seen", [-1]),
+    ],
+)  # fmt: skip
+def test_every_header_field_is_checked(state, name, value):
+    """A header field that can't be is named."""
+    header, arrays = state
+    with pytest.raises(CheckpointError, match=name):
+        slam_from_state("map", {**header, name: value}, arrays, "cpu")
+    if value is None:
+        with pytest.raises(CheckpointError, match=name):
+            slam_from_state("map", {n: v for n, v in header.items() if n != name}, arrays, "cpu")
+
+
+def test_image_that_does_not_inflate_is_refused(state):
+    """Compressed images are looked into at load, not when a mapping call wants one."""
+    header, arrays = state
+    with pytest.raises(CheckpointError, match="image_1"):
+        slam_from_state("map", header, {**arrays, "image_1_rgb": np.arange(50, dtype=np.uint8)}, "cpu")
+
+
+@given(data=st.data())
+@settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_damaged_map_file_is_refused(frames, tmp_path_factory, data):
+    """Flipped, cut or foreign bytes anywhere in the file of a real map: `CheckpointError`, and nothing else."""
+    path = _map_file(frames, tmp_path_factory)
+    content = bytearray(path.read_bytes())
+    place = data.draw(st.integers(0, len(content) - 1))
+    if data.draw(st.booleans()):
+        content[place] ^= 1 << data.draw(st.integers(0, 7))
+    else:
+        content = content[:place] + data.draw(st.binary(max_size=20))
+    damaged = path.with_name("damaged.safetensors")
+    damaged.write_bytes(content)
+    if content != path.read_bytes():
+        with pytest.raises(CheckpointError, match="damaged.safetensors"):
+            Slam.load(damaged, "cpu")
+
+
+_files: list = []
+
+
+def _map_file(frames, factory):
+    if not _files:
+        path = factory.mktemp("map") / "map.safetensors"
+        run(frames[:1], "grid.margin=0.1").save(path)
+        _files.append(path)
+    return _files[0]
+
+
+def test_settings_of_a_loaded_map_can_change(frames, tmp_path):
+    """Tracking and mapping settings may; the spacing of the grids may not. The caller's settings stay as they are."""
+    run(frames[:1]).save(tmp_path / "map.safetensors")
+    config = Config.from_preset("default", [*SETTINGS, "mapping.iterations=7"])
+    slam = Slam.load(tmp_path / "map.safetensors", "cpu", config=config, localize_only=True)
+    assert slam.config.mapping.iterations == 7 and not slam.config.mapping.enabled and config.mapping.enabled
+    other = config.updated(["grid.fine_spacing=0.2"])
+    with pytest.raises(ConfigError, match="grid.fine_spacing = 0.2 does not fit"):
+        Slam.load(tmp_path / "map.safetensors", "cpu", config=other)
+    with pytest.raises(InputError, match="load a map"):
+        run(frames[:1], "mapping.enabled=false")
+
+
+def test_saving_copies_no_grid(frames, tmp_path):
+    """What saving allocates is small beside the grids."""
+    slam = run(frames[:1], "grid.margin=3")
+    size = sum(grid.features.capacity for grid in slam.scene.grids.values())
+    tracemalloc.start()
+    slam.save(tmp_path / "map.safetensors")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert size > 8e6 and peak < 0.2 * size
+    assert (tmp_path / "map.safetensors").stat().st_size > size
+
+
+def test_image_budget_changes_no_result(frames):
+    """With room for just the images of two windows, the same poses and features come out as with room for all."""
+    wide, tight = run(frames), run(frames, f"keyframes.max_gigabytes={7.5 * IMAGE_GIGABYTES}")
+    wide.finish(), tight.finish()
+    assert len(tight.keyframes) > 7 == tight._images.rgb.shape[0]
+    np.testing.assert_array_equal(tight.trajectory.poses, wide.trajectory.poses)
+    for level, grid in wide.scene.grids.items():
+        np.testing.assert_array_equal(tight.scene.grids[level].features.numpy(), grid.features.numpy())
+
+
+def test_image_budget_below_a_window_is_refused_at_once():
+    """What mapping needs at a time, what there is room for, and which settings to change."""
+    with pytest.raises(MapSizeError, match="needs 7 images of 48 x 36.*has room for 6.*mapping.window"):
+        run([], f"keyframes.max_gigabytes={6.5 * IMAGE_GIGABYTES}")
+
+
+def test_memory_report_adds_up(frames):
+    """Bytes by part, and the observed volume: that of the cone before a wall."""
+    slam = Slam(CAMERA, Config.from_preset("default", SETTINGS), "cpu", decoders=load_decoders())
+    slam.step(frames[0].rgb, np.full((36, 48), 3.0, np.float32))
+    report = slam.memory()
+    assert report["grid_bytes"] == sum(grid.features.capacity for grid in slam.scene.grids.values())
+    parts = report["grid_bytes"] + report["keyframe_bytes"] + report["seen_bytes"]
+    assert report["state_bytes"] == parts and report["seen_bytes"] == 2 * 9 * 12
+    cone = 3.0**3 / 3 * (48 / 40) * (36 / 40)
+    assert report["observed_m3"] == pytest.approx(cone, rel=0.2)
+    assert report["state_bytes_per_observed_m3"] == pytest.approx(parts / report["observed_m3"])
+
+
+@pytest.mark.slow
+def test_memory_stays_flat_over_a_thousand_frames():
+    """A camera that walks the same way to and fro, tracked and mapped at its true poses: after the first round neither
+    the map nor the process grows, but for a few small keyframes.
+    """
+    import resource
+
+    count = 40
+    sequence = SyntheticSequence(0, count, intrinsics=CAMERA)
+    frames = [*(sequence[n] for n in range(count)), *(sequence[n] for n in reversed(range(count)))]
+    config = Config.from_preset("default", [*SETTINGS, "keyframes.every=20", "tracking.use_given_poses=true"])
+    config.mapping.bundle_adjustment = False
+    slam = Slam(CAMERA, config, "cpu", decoders=load_decoders())
+    used = []
+    for n in range(1000):
+        frame = frames[n % len(frames)]
+        slam.step(frame.rgb, frame.depth, T_world_camera=frame.T_world_camera)
+        slam._tracker.track(slam.scene.arrays(), slam._images, n, frame.T_world_camera)
+        if n % 200 == 199:
+            used.append((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, slam.memory()["grid_bytes"]))
+    process, grids = zip(*used, strict=True)
+    assert process[-1] - process[0] < 20 * 1024, f"the process grew: {process} KiB"
+    assert grids[-1] == grids[0]
+    assert len(slam.keyframes) == 50

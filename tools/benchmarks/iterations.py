@@ -1,0 +1,231 @@
+"""Time warpslam against plain torch on the same inputs, both on two threads, alternating in one process.
+
+    python -m tools.benchmarks.iterations --repeats 5 --out benchmark.json
+
+A room is rendered (640x480), its first frame mapped, and then each phase is timed: a tracking iteration (200 rays; the
+paper's Adam, and Gauss-Newton), mapping iterations by stage (1000 rays, five frames), a whole mapping call (60
+iterations with selection, coarse level and bundle adjustment) and a part of the first frame. `torch` is
+`tools/benchmarks/torch_slam.py`: the same iteration, built as the original is. Medians of the repeats; the last
+column is theirs over ours. Also measured: the machine's peak for single-precision matrix products, and what a tracking
+iteration takes when its kernels have no thread, which is the time of launching and of Python.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+import warp as wp
+
+from tools.benchmarks.torch_slam import Level, TorchSlam
+from warpslam.camera import Intrinsics
+from warpslam.config import Config
+from warpslam.mapping.frustum import measured_extent
+from warpslam.poses import vector_from_pose
+from warpslam.runtime.launching import Launcher
+from warpslam.slam import Slam
+from warpslam.synthetic import SyntheticSequence
+
+CAMERA = Intrinsics(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
+PAPER = ["sampling.jitter=false", "tracking.use_given_poses=true", "mapping.coarse=false", "keyframes.every=1"]
+STAGES = {"middle": (1.0, 1.0), "fine": (0.0, 1.0), "color": (0.0, 0.0)}
+SPACING = 4  # frames between those of the window
+
+
+class Ours:
+    """The package at the point where frame 5 of a walk is to be mapped, four frames lying behind it."""
+
+    def __init__(self, sequence: SyntheticSequence, overrides: list[str]) -> None:
+        """Map the first frame, then take in the others as keyframes."""
+        self.frames = [sequence[SPACING * i] for i in range(6)]
+        first = ["mapping.first_iterations=200", "mapping.every=1000"]
+        self.slam = Slam(CAMERA, Config.from_preset("default", [*PAPER, *first, *overrides]), device=None)
+        for frame in self.frames[:5]:
+            self.slam.step(frame.rgb, frame.depth, T_world_camera=frame.T_world_camera)
+        last = self.frames[5]
+        self.slam.scene.cover(*measured_extent(last.depth, last.T_world_camera, self.slam.intrinsics))
+        self.slam._images.set(0, last.rgb, last.depth)
+        self.vector = vector_from_pose(last.T_world_camera)
+
+    def map_call(self, iterations: int, stage: str | None = None, *, whole: bool = False) -> None:
+        """A mapping call; with a stage, all iterations are of that stage (but for the first)."""
+        config = self.slam._mapper.config
+        config.iterations = iterations
+        config.middle_share, config.fine_share = STAGES[stage] if stage else (0.4, 0.6)
+        config.coarse, config.bundle_adjustment = whole, whole
+        keyframes = self.slam.keyframes
+        self.slam._mapper.map_frame(self.slam._images, 5, self.vector, keyframes)
+
+    def map_first(self, iterations: int) -> None:
+        """Iterations of the first frame, at its rates."""
+        config = self.slam._mapper.config
+        config.first_iterations, config.coarse = iterations, False
+        config.middle_share, config.fine_share = 0.4, 0.6
+        self.slam._mapper.map_first(self.slam._images, 5, self.vector)
+
+    def track(self, optimizer: str, iterations: int) -> None:
+        """Tracking with a number of iterations, 200 rays."""
+        config = self.slam._tracker.config
+        config.optimizer, config.iterations, config.keep_best = optimizer, iterations, "last"
+        self.slam._tracker.track(self.slam.scene.arrays(), self.slam._images, 5, self.frames[5].T_world_camera)
+
+
+def torch_twin(ours: Ours) -> tuple[TorchSlam, dict[str, np.ndarray], TorchSlam]:
+    """The torch state with the same map, the masks of the frustum, and one that has the last frame alone."""
+    scene = ours.slam.scene
+    levels = {}
+    for level in ("middle", "fine", "color"):
+        grid = scene.grids[level]
+        table = torch.from_numpy(grid.features.numpy().reshape(*grid.shape, 32))
+        low = grid.first * grid.spacing
+        high = low + (np.array(grid.shape) - 1) * grid.spacing
+        corners = [torch.tensor(corner, dtype=torch.float32) for corner in (low, high)]
+        levels[level] = Level(table.permute(3, 0, 1, 2)[None].contiguous(), *corners)
+    ours.map_call(1)  # selects the vertices
+    masks = {}
+    for level in levels:
+        mask = np.zeros(scene.grids[level].row_count, bool)
+        mask[ours.slam._mapper._grids[level].rows.numpy()] = True
+        masks[level] = mask
+    decoders = {weights.level: weights for weights in scene.decoder_weights}
+    chosen = [ours.frames[5], *ours.frames[1:5]]
+    images = [(frame.rgb, frame.depth) for frame in chosen]
+    poses = np.stack([vector_from_pose(frame.T_world_camera) for frame in chosen])
+    whole = TorchSlam(levels, decoders, scene.bounds, CAMERA, images, poses)
+    alone = TorchSlam(dict(levels), decoders, scene.bounds, CAMERA, images[:1], poses[:1])
+    return whole, masks, alone
+
+
+def alternate(pairs: dict[str, tuple[Callable, Callable]], repeats: int) -> dict[str, tuple[float, float]]:
+    """Median seconds of both functions of each pair, run in turns."""
+    result = {}
+    for name, (ours, theirs) in pairs.items():
+        ours(), theirs()
+        times: list[list[float]] = [[], []]
+        for _ in range(repeats):
+            for column, function in zip(times, (ours, theirs), strict=True):
+                start = time.perf_counter()
+                function()
+                column.append(time.perf_counter() - start)
+        result[name] = (float(np.median(times[0])), float(np.median(times[1])))
+    return result
+
+
+def launching_share(ours: Ours, optimizer: str, repeats: int) -> float:
+    """Time of 100 tracking iterations whose kernels have no thread over that of whole ones: medians, in turns."""
+    commands: list[wp.Launch] = []
+    original = Launcher.command
+
+    def command(self: Launcher, *arguments: object) -> wp.Launch:
+        commands.append(original(self, *arguments))
+        return commands[-1]
+
+    def run() -> None:
+        ours.track(optimizer, 100)
+
+    ours.slam._tracker._launcher.forget()
+    Launcher.command = command
+    try:
+        run()  # records the launches
+    finally:
+        Launcher.command = original
+    whole = [recorded.bounds for recorded in commands]
+
+    def without_threads() -> None:
+        for recorded in commands:
+            recorded.set_dim((0,) * max(recorded.kernel.adj.kernel_dim, 1))
+        try:
+            run()
+        finally:
+            for recorded, bounds in zip(commands, whole, strict=True):
+                recorded.bounds = recorded.params[0] = bounds
+
+    launching, full = alternate({"": (without_threads, run)}, repeats)[""]
+    return launching / full
+
+
+def matrix_peak(size: int = 1024, repeats: int = 20) -> float:
+    """GFLOP/s of single-precision matrix products on all threads, best of the repeats."""
+    a, b = torch.randn(2, size, size)
+    best = np.inf
+    for _ in range(repeats):
+        start = time.perf_counter()
+        a @ b
+        best = min(best, time.perf_counter() - start)
+    return 2e-9 * size**3 / best
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=2, help="threads of torch; warpslam takes all cores")
+    parser.add_argument("--set", nargs="+", default=[], help="settings of warpslam, group.field=value")
+    parser.add_argument("--out", type=Path, help="JSON file")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(options.threads)
+    torch.manual_seed(0)
+    sequence = SyntheticSequence(1_000_000, 40, intrinsics=CAMERA)
+    ours = Ours(sequence, options.set)
+    theirs, masks, alone = torch_twin(ours)
+    n = 10
+
+    def torch_mapping(stage: str, count: int) -> Callable:
+        def run() -> None:
+            theirs.start_mapping(masks)
+            for _ in range(count):
+                theirs.map_once(stage, 1000)
+
+        return run
+
+    def torch_call(problem: TorchSlam, count: int, factor: float, *, adjust: bool) -> Callable:
+        def run() -> None:
+            problem.start_mapping(masks, adjust=adjust)
+            for j in range(count):
+                stage = "middle" if j <= 0.4 * count else "fine" if j <= 0.6 * count else "color"
+                problem.map_once(stage, 1000, factor=factor)
+
+        return run
+
+    def torch_tracking() -> None:
+        alone.start_tracking()
+        for _ in range(n):
+            alone.track_once(200)
+
+    ours.slam._tracker.config.pixels = 200
+    ours.slam._tracker._batch = ours.slam._tracker._new_batch(200)
+    pairs = {"tracking, Adam": (lambda: ours.track("adam", n), torch_tracking)}
+    pairs["tracking, Gauss-Newton"] = (lambda: ours.track("gauss_newton", n), torch_tracking)
+    for stage in STAGES:
+        pairs[f"mapping, {stage}"] = (lambda stage=stage: ours.map_call(n, stage), torch_mapping(stage, n))
+    pairs["mapping call"] = (lambda: ours.map_call(60, whole=True), torch_call(theirs, 60, 1.0, adjust=True))
+    pairs["first frame, 60 iterations"] = (lambda: ours.map_first(60), torch_call(alone, 60, 5.0, adjust=False))
+    divide = {name: n if name.startswith(("tracking", "mapping, ")) else 1 for name in pairs}
+    times = alternate(pairs, options.repeats)
+    peak = matrix_peak()
+    shares = {optimizer: launching_share(ours, optimizer, options.repeats) for optimizer in ("adam", "gauss_newton")}
+    rows = {}
+    print("| phase | warpslam [ms] | torch [ms] | ratio |\n|---|---|---|---|")
+    for name, (a, b) in times.items():
+        rows[name] = {"warpslam_ms": 1e3 * a / divide[name], "torch_ms": 1e3 * b / divide[name], "ratio": b / a}
+        print("| {} | {:.1f} | {:.1f} | {:.1f} |".format(name, *rows[name].values()))
+    print(
+        f"matrix products: {peak:.0f} GFLOP/s on {options.threads} threads; kernels compiled in "
+        f"{ours.slam.compile_seconds:.1f} s"
+    )
+    for optimizer, share in shares.items():
+        print(f"launching and Python in a tracking iteration, {optimizer}: {share:.1%}")
+    if options.out:
+        result = {"phases": rows, "matrix_gflops": peak, "launching_share": shares}
+        options.out.write_text(json.dumps(result, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,1 +1,0 @@
-"""Pretraining of the decoders: sampled rooms, networks, the two training phases, and the comparison of decoders."""

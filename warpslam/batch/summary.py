@@ -1,0 +1,92 @@
+"""What a batch came to: summary.csv and summary.html in its folder."""
+
+from __future__ import annotations
+
+import csv
+import html
+from collections.abc import Sequence
+from pathlib import Path
+
+from warpslam.batch.status import FINISHED, SKIPPED, JobStatus
+from warpslam.runs.folder import RunFolder
+
+COLUMNS = ("sequence", "status", "frames", "lost", "ATE RMSE [cm]", "frames/s", "time [s]", "memory [MiB]", "message")
+
+_MESSAGE_LENGTH = 200
+_STYLE = """
+body { font: 15px/1.4 system-ui, sans-serif; margin: 2em; color: #222 }
+table { border-collapse: collapse }
+th, td { padding: .35em .8em; text-align: left; border-bottom: 1px solid #ddd; vertical-align: top }
+td.number { text-align: right; font-variant-numeric: tabular-nums }
+tr.bad td:nth-child(2) { color: #b00020; font-weight: 600 }
+"""
+
+
+def cells(status: JobStatus) -> tuple[str, ...]:
+    """A row as text, in the order of `COLUMNS`; empty where there is no figure."""
+    notes = [f"{status.attempt} attempts"] if status.attempt > 1 else []
+    if status.resumed_after:
+        notes.append(f"resumed after {status.resumed_after} frames")
+    return (
+        status.name,
+        status.status + (f" ({', '.join(notes)})" if notes else ""),
+        f"{status.done}/{status.total}" if status.total else "",
+        str(status.lost) if status.total else "",
+        _figure(None if status.ate_rmse is None else 100 * status.ate_rmse, 2),
+        _figure(status.fps, 2),
+        _figure(status.seconds, 1),
+        _figure(status.peak_memory_mib, 0),
+        first_line(status.message),
+    )
+
+
+def first_line(message: str) -> str:
+    """What fits into a table; all of it is in the state file of the job."""
+    line = message.split("\n")[0]
+    return line if len(line) <= _MESSAGE_LENGTH else line[: _MESSAGE_LENGTH - 3] + "..."
+
+
+def write_summary(statuses: Sequence[JobStatus], output: Path) -> tuple[Path, Path]:
+    """Write both files; returns their paths."""
+    csv_path, html_path = output / "summary.csv", output / "summary.html"
+    with open(csv_path, "w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
+        writer.writerows(cells(status) for status in statuses)
+    html_path.write_text(_html(statuses, output), encoding="utf-8")
+    return csv_path, html_path
+
+
+def is_good(status: JobStatus) -> bool:
+    """Whether the job has its results, from now or before."""
+    return status.status in (FINISHED, SKIPPED)
+
+
+def _figure(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def _html(statuses: Sequence[JobStatus], output: Path) -> str:
+    rows = []
+    for status in statuses:
+        texts = [html.escape(text) for text in cells(status)]
+        name = html.escape(status.name, quote=True)
+        folder = RunFolder(output / status.name)
+        links = " ".join(
+            f'<a href="{name}/{file.name}">{text}</a>'
+            for file, text in ((folder.top_view, "path"), (folder.panels, "views"), (folder.mesh, "mesh"))
+            if file.is_file()
+        )
+        body = "".join(
+            f'<td class="number">{text}</td>' if 2 <= column <= 7 else f"<td>{text}</td>"
+            for column, text in enumerate(texts)
+        )
+        row_class = "good" if is_good(status) else "bad"
+        rows.append(f'<tr class="{row_class}">{body}<td>{links}</td></tr>')
+    head = "".join(f"<th>{html.escape(column)}</th>" for column in (*COLUMNS, "files"))
+    good = sum(map(is_good, statuses))
+    return (
+        f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{html.escape(output.name)}</title>\n'
+        f"<style>{_STYLE}</style>\n<h1>{html.escape(output.name)}: {good} of {len(statuses)} sequences done</h1>\n"
+        f"<table>\n<tr>{head}</tr>\n" + "\n".join(rows) + "\n</table>\n</html>\n"
+    )

@@ -1,0 +1,329 @@
+"""Settings: validated groups with units, presets per dataset, yaml in and out.
+
+Defaults are the published ones for Replica (released code; paper A.6) where nothing else is said.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from warpslam.config.overrides import merge, parse_override
+from warpslam.config.presets import PRESETS
+from warpslam.errors import ConfigError
+
+
+class _Group(BaseModel):
+    model_config = ConfigDict(extra="forbid", validate_assignment=True, allow_inf_nan=False)
+
+
+class GridConfig(_Group):
+    """Feature grids (Sec. 3.1)."""
+
+    coarse_spacing: float = Field(2.0, gt=0, description="vertex spacing of the coarse level [m]")
+    middle_spacing: float = Field(0.32, gt=0, description="vertex spacing of the middle level [m]")
+    fine_spacing: float = Field(0.16, gt=0, description="vertex spacing of the fine level [m]")
+    color_spacing: float = Field(0.16, gt=0, description="vertex spacing of the colour grid [m]")
+    coarse_std: float = Field(0.01, ge=0, description="standard deviation of the initial coarse features")
+    middle_std: float = Field(0.01, ge=0, description="standard deviation of the initial middle features")
+    fine_std: float = Field(0.0001, ge=0, description="standard deviation of the initial fine features")
+    color_std: float = Field(0.01, ge=0, description="standard deviation of the initial colour features")
+    margin: float = Field(0.6, gt=0, description="the map reaches this far beyond what was seen [m]")
+    max_depth: float = Field(10.0, gt=0, description="measurements beyond this do not count [m]")
+    max_gigabytes: float = Field(
+        8.0, gt=0, description="refuse to grow the grids and their optimiser state beyond this [GB]"
+    )
+
+
+class SamplingConfig(_Group):
+    """Samples along a ray (Sec. 3.2)."""
+
+    stratified: int = Field(32, ge=2, le=256, description="samples between camera and exit")
+    surface: int = Field(16, ge=2, le=256, description="samples within 5 % of the measured depth")
+    jitter: bool = Field(
+        True, description="random position inside each stratum (paper); even spacing (released code) tracks 5 x worse"
+    )
+    min_weight: float = Field(
+        1e-4, ge=0, le=0.01, description="samples that weigh less need no colour (0 = exact): errs below samples x this"
+    )
+    min_gradient: float = Field(
+        3e-5, ge=0, le=0.01, description="smaller derivatives of a ray's depth [m] by a logit are dropped (0 = exact)"
+    )
+    min_transmittance: float = Field(
+        1e-4,
+        ge=0,
+        le=0.01,
+        description="a ray ends where less light is left (0 = exact): its depth errs below this x its largest depth",
+    )
+
+
+class TrackingConfig(_Group):
+    """Camera tracking (Sec. 3.3, Eq. 11-12)."""
+
+    optimizer: Literal["adam", "gauss_newton"] = Field(
+        "gauss_newton", description="Adam on the pose vector (paper), or Gauss-Newton on the same loss, reweighted"
+    )
+    pixels: int = Field(300, ge=16, le=100_000, description="rays per iteration")
+    iterations: int = Field(6, ge=1, le=10_000, description="iterations per frame")
+    learning_rate: float = Field(
+        1e-3, gt=0, description="of the translation [m], and of the quaternion times rotation_rate_factor"
+    )
+    rotation_rate_factor: float = Field(
+        1.0, gt=0, description="quaternion rate over translation rate; 0.2 = separate rates of the code"
+    )
+    final_rate_factor: float = Field(
+        0.1, gt=0, le=1, description="learning rate of the last iteration over the first (1 = constant)"
+    )
+    color_weight: float = Field(0.5, ge=0, description="lambda_pt of Eq. 12")
+    ignore_edge_u: int = Field(20, ge=0, description="columns left out on both sides [px]")
+    ignore_edge_v: int = Field(20, ge=0, description="rows left out on both sides [px]")
+    dynamic_filter: float = Field(
+        10.0, ge=0, description="drop rays beyond this multiple of the median residual; 0 = off"
+    )
+    median_includes_missing: bool = Field(
+        False, description="rays without depth count in the median, as in the released code"
+    )
+    seen_only: bool = Field(
+        True,
+        description="only rays count that end where a mapped frame has measured something, for elsewhere the map is a "
+        "guess; off = all rays (paper)",
+    )
+    constant_speed: bool = Field(True, description="start from the last motion instead of the last pose")
+    keep_best: Literal["last", "fixed_pixels"] = Field(
+        "fixed_pixels",
+        description="final pose: the last one, or the best of start, last and mean on one fixed set of pixels",
+    )
+    use_given_poses: bool = Field(False, description="take T_world_camera as given: no tracking, no bundle adjustment")
+    lost_depth_error: float = Field(
+        0.15, gt=0, description="mean depth residual of the inliers beyond which tracking is lost [m]"
+    )
+    lost_inliers: float = Field(0.35, ge=0, le=1, description="share of inliers below which tracking is lost")
+    recovery_factor: int = Field(5, ge=1, description="iterations and pixels grow by this when tracking is lost")
+    max_step: float = Field(
+        0.1, gt=0, description="a longer step a frame [m] is doubted, unless the last ones were nearly as long"
+    )
+    max_turn: float = Field(10.0, gt=0, description="the same for the turn a frame [degrees]")
+    relocalization: bool = Field(True, description="a lost camera is looked for at the keyframes")
+    relocalization_keyframes: int = Field(
+        5, ge=1, description="keyframes tried a frame, those most like it in coarse grey and depth"
+    )
+    relocalized_depth_error: float = Field(
+        0.05, gt=0, description="a pose found again errs less in depth than this [m], or 1.5 x what was usual before"
+    )
+
+
+class MappingConfig(_Group):
+    """Mapping and local bundle adjustment (Sec. 3.3, Eq. 8-10)."""
+
+    enabled: bool = Field(True, description="off: the camera is only tracked in a map that was loaded")
+    every: int = Field(5, ge=1, description="map every n-th frame")
+    pixels: int = Field(1000, ge=16, le=200_000, description="rays per iteration over all frames of the window")
+    active_share: float = Field(
+        0.5, ge=0, le=1, description="share of the rays drawn where the map errs in depth; 0 = all uniform (paper)"
+    )
+    window: int = Field(
+        5, ge=1, le=64, description="frames optimised together: selected keyframes, the last one, the current frame"
+    )
+    selection: Literal["overlap", "global"] = Field(
+        "overlap", description="keyframes of the window by overlap or at random"
+    )
+    first_iterations: int = Field(500, ge=1, description="iterations on the first frame; the paper's code has 1500")
+    iterations: int = Field(60, ge=1, description="iterations on later frames")
+    middle_share: float = Field(0.4, ge=0, le=1, description="share of iterations after which the fine stage starts")
+    fine_share: float = Field(0.6, ge=0, le=1, description="share of iterations after which the colour stage starts")
+    middle_rate: float = Field(0.1, gt=0, description="learning rate of middle features in the middle stage")
+    geometry_rate: float = Field(
+        0.005, gt=0, description="learning rate of middle and fine features in the later stages"
+    )
+    color_rate: float = Field(0.005, gt=0, description="learning rate of colour features and of the colour decoder")
+    coarse_rate: float = Field(0.001, gt=0, description="learning rate of coarse features")
+    first_rate_factor: float = Field(
+        5.0, gt=0, description="all grid and decoder rates grow by this on the first frame"
+    )
+    color_weight: float = Field(0.2, ge=0, description="lambda_p of Eq. 10")
+    loss: Literal["sum", "mean"] = Field("sum", description="sums over rays (released code) or means (Eq. 8-9)")
+    train_color_decoder: bool = Field(True, description="the colour decoder is optimised with the map")
+    moved_margin: float = Field(
+        0.0,
+        ge=0,
+        description="rays of keyframes that the current depth contradicts by this much are left out, for something has "
+        "moved [m]; 0 = off (paper)",
+    )
+    depth_start: bool | None = Field(
+        None,
+        description="middle features that are seen for the first time start from the measured depth, not as noise "
+        "(paper): completer maps, but a tracked camera may drift with it; empty = where poses are given",
+    )
+    optimize_middle: bool = Field(True, description="off: middle features stay as they began, for ablations (Fig. 9)")
+    optimize_fine: bool = Field(True, description="off: fine features stay as they began, for ablations (Fig. 9)")
+    frustum_selection: bool = Field(True, description="only vertices in the current frustum change (A.1)")
+    frustum_margin: float = Field(0.5, ge=0, description="selected vertices reach this far behind the surface [m]")
+    coarse: bool = Field(True, description="optimise the coarse level, which forecasts unseen geometry")
+    coarse_iterations: int = Field(60, ge=1, description="iterations of the coarse level per mapping call")
+    bundle_adjustment: bool = Field(True, description="refine the window's poses in the colour stage")
+    bundle_adjustment_rate: float = Field(
+        1e-3, ge=0, description="learning rate of the window's poses; the paper has 0 for Co-Fusion"
+    )
+    bundle_adjustment_filter: float = Field(
+        5.0,
+        ge=0,
+        description="rays whose depth error exceeds this multiple of the median do not pull on poses, for the map is "
+        "not formed there; 0 = all pull (paper)",
+    )
+    bundle_adjustment_keyframes: int = Field(5, ge=2, description="keyframes needed before poses are refined")
+    color_refinement: bool = Field(True, description="refine the whole map after the last frame")
+    refinement_rounds: int = Field(5, ge=1, description="rounds of `iterations` in the final refinement")
+
+
+class KeyframeConfig(_Group):
+    """Keyframe selection (Sec. 3.4)."""
+
+    policy: Literal["interval", "information_gain"] = Field("interval", description="when a frame becomes a keyframe")
+    every: int = Field(20, ge=1, description="interval policy: frames between keyframes; the paper's code has 50")
+    known_share: float = Field(
+        0.65, gt=0, lt=1, description="information gain: insert when the map explains less than this share of pixels"
+    )
+    known_error: float = Field(
+        0.1, gt=0, description="information gain: a pixel is explained below this relative depth error"
+    )
+    max_gigabytes: float = Field(
+        2.0, gt=0, description="images on the device [GB]; more keyframes than fit are kept compressed in host memory"
+    )
+
+
+class MeshingConfig(_Group):
+    """Mesh extraction (A.4)."""
+
+    voxel: float = Field(0.02, gt=0, description="edge of a marching-cubes cell [m]")
+    level_set: float = Field(
+        -0.1,
+        description="logit of the surface; 0 (occupancy 1/2, the paper) is more accurate where the map is well formed, "
+        "and loses what was mapped for a short time",
+    )
+    min_component_area: float = Field(
+        0.2, ge=0, description="smaller loose pieces are dropped [m^2], unless measured depth confirms them"
+    )
+
+
+class TsdfConfig(_Group):
+    """Baseline: fusion of a truncated signed distance at given poses (``--method tsdf``)."""
+
+    voxel: float = Field(0.02, gt=0, description="edge of a voxel [m]")
+    truncation_voxels: float = Field(4.0, ge=1, le=32, description="distances are cut off at this many voxels")
+    min_weight: int = Field(2, ge=1, description="frames that a voxel must be in to count in meshes and views")
+
+
+class ImapConfig(_Group):
+    """Baseline: iMAP as the authors of NICE-SLAM re-implemented it (``--method imap``).
+
+    Lengths inside the network and its losses are metres times ``scale``. Image borders, sampling along rays, thresholds
+    of a lost track and keyframes are those of the other groups.
+    """
+
+    scale: float = Field(0.1, gt=0, description="network units per metre")
+    importance: int = Field(12, ge=4, le=64, description="samples drawn where the stratified ones found something")
+    empty_samples: int = Field(
+        16, ge=4, le=64, description="samples in front of the surface that should be empty; released code 32"
+    )
+    empty_weight: float = Field(5e-4, ge=0, description="weight of |density| at those samples")
+    tracking_rate: float = Field(
+        5e-4, gt=0, description="learning rate of the pose in the first iteration; tracking.final_rate_factor applies"
+    )
+    tracking_pixels: int = Field(150, ge=16, le=100_000, description="rays per tracking iteration; released code 5000")
+    tracking_iterations: int = Field(12, ge=1, le=10_000, description="iterations per frame; released code 50")
+    mapping_rate: float = Field(
+        1e-3, gt=0, description="learning rate of the network, 0.8 times after every 200 steps; released code 2e-4"
+    )
+    mapping_pixels: int = Field(120, ge=16, le=200_000, description="rays per mapping iteration; released code 5000")
+    first_iterations: int = Field(800, ge=1, description="iterations on the first frame; released code 1500")
+    rounds: int = Field(3, ge=1, description="rounds of a mapping call, each with its own random window")
+    iterations: int = Field(20, ge=1, description="iterations of a round on later frames; released code 100")
+    refinement_rounds: int = Field(5, ge=0, description="rounds of 3 x iterations after the last frame")
+    color_weight: float = Field(0.05, ge=0, description="weight of colour against depth in mapping")
+    level_set: float = Field(10.0, gt=0, description="density of the surface in meshes")
+
+
+class Config(_Group):
+    """All settings of a run."""
+
+    grid: GridConfig = Field(default_factory=GridConfig)
+    sampling: SamplingConfig = Field(default_factory=SamplingConfig)
+    tracking: TrackingConfig = Field(default_factory=TrackingConfig)
+    mapping: MappingConfig = Field(default_factory=MappingConfig)
+    keyframes: KeyframeConfig = Field(default_factory=KeyframeConfig)
+    meshing: MeshingConfig = Field(default_factory=MeshingConfig)
+    imap: ImapConfig = Field(default_factory=ImapConfig)
+    tsdf: TsdfConfig = Field(default_factory=TsdfConfig)
+    schedule: Literal["strict", "overlapped"] = Field(
+        "strict",
+        description="strict: mapping after tracking, runs repeat to the bit; overlapped: beside it, and the map is at "
+        "most one mapping interval behind",
+    )
+    decoders: str | None = Field(None, description="decoder checkpoint; the package's own when empty")
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any], source: str = "settings") -> Config:
+        """Validate a nested dictionary.
+
+        Raises:
+            ConfigError: names each field that does not fit and the accepted range.
+        """
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            lines = [f"{'.'.join(map(str, e['loc']))}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
+            raise ConfigError(f"{source}: " + "; ".join(lines)) from None
+
+    @classmethod
+    def from_preset(cls, name: str = "default", overrides: list[str] | None = None) -> Config:
+        """Settings of a preset with ``overrides`` of the form ``group.field=value`` on top.
+
+        Raises:
+            ConfigError: unknown preset, malformed override, or a value out of range.
+        """
+        if name not in PRESETS:
+            raise ConfigError(f"preset {name!r} is unknown; choose one of {', '.join(sorted(PRESETS))}")
+        values: dict[str, Any] = {}
+        for part in (PRESETS[name], *map(parse_override, overrides or [])):
+            merge(values, part)
+        return cls.from_dict(values, source=f"preset {name}")
+
+    def updated(self, overrides: list[str]) -> Config:
+        """These settings with overrides of the form ``group.field=value``.
+
+        Raises:
+            ConfigError: malformed override, or a value out of range.
+        """
+        values = self.model_dump()
+        for override in overrides:
+            merge(values, parse_override(override))
+        return self.from_dict(values)
+
+    def with_files(self, decoders: str | None = None, poses: str | Path | None = None) -> Config:
+        """These settings for a run that is given a decoder checkpoint, or a trajectory whose poses are taken as they
+        are; None changes nothing.
+        """
+        tracking = self.tracking.model_copy(update={"use_given_poses": True}) if poses else self.tracking
+        return self.model_copy(update={"decoders": decoders or self.decoders, "tracking": tracking})
+
+    @classmethod
+    def load(cls, path: str | Path) -> Config:
+        """Read settings from a yaml file.
+
+        Raises:
+            ConfigError: the file can't be read, is no yaml mapping, or a value does not fit.
+        """
+        try:
+            values = yaml.safe_load(Path(path).read_text())
+        except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
+            raise ConfigError(f"{path}: can't be read as yaml: {error}") from None
+        if not isinstance(values, dict):
+            raise ConfigError(f"{path}: expected a mapping of groups, found {type(values).__name__}")
+        return cls.from_dict(values, source=str(path))
+
+    def save(self, path: str | Path) -> None:
+        """Write all settings as yaml."""
+        Path(path).write_text(yaml.safe_dump(self.model_dump(), sort_keys=False))

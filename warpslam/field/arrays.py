@@ -1,0 +1,90 @@
+"""What a pass through the field reads and which gradients it is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import warp as wp
+
+from warpslam.camera import Intrinsics
+from warpslam.field.packing import PackedDecoder
+from warpslam.kernels.grid import Lattice, Vec32
+from warpslam.runtime.cores import slice_count
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Work that is skipped; zeros are exact.
+
+    min_weight: Samples that weigh less get no colour: rgb errs by less than samples * min_weight.
+    min_gradient: Derivatives of the loss by a logit up to this are dropped.
+    min_transmittance: A ray ends where less is left: depth errs by less than this * z_max, and rgb by less than this *
+        the brightest colour.
+    """
+
+    min_weight: float = 0.0
+    min_gradient: float = 0.0
+    min_transmittance: float = 0.0
+
+
+EXACT = Thresholds()
+
+
+@dataclass
+class FieldArrays:
+    """What a query of the field reads.
+
+    lattices, features: by level; features are arrays of `Vec32`, one row a vertex.
+    decoders: packed weights by level.
+    seen: uint8, one a vertex of the colour level: 1 where a mapped frame has measured what is there; None = everywhere.
+    low, high: the map's bound [m]; samples on or beyond it are opaque and constant.
+    """
+
+    lattices: dict[str, Lattice]
+    features: dict[str, wp.array]
+    decoders: dict[str, PackedDecoder]
+    low: wp.vec3
+    high: wp.vec3
+    seen: wp.array | None = None
+
+
+@dataclass
+class GridGradient:
+    """Gradient of one level: ``buffers`` (slices, rows) of `Vec32`; rows with ``selected`` 0 get none."""
+
+    buffers: wp.array
+    selected: wp.array
+
+
+@dataclass
+class Gradients:
+    """Which gradients an iteration wants; everything absent is never computed.
+
+    grids: by level.
+    points: sample positions, and through them rays and poses.
+    color_weights: (slices, rows) buffers of `Vec32` for the colour decoder, or None.
+    inliers_move: only those rays reach the poses that `RayBatch.choose_inliers` chooses after the rendering.
+    """
+
+    grids: dict[str, GridGradient] = field(default_factory=dict)
+    points: bool = False
+    color_weights: wp.array | None = None
+    inliers_move: bool = False
+
+
+def gradient_buffers(row_count: int, device: wp.Device) -> wp.array:
+    """Zeroed buffers (slices, row_count) of `Vec32` for the gradient of a grid or of decoder weights."""
+    return wp.zeros((slice_count(device), row_count), dtype=Vec32, device=device)
+
+
+def camera_vectors(camera: Intrinsics) -> list[wp.vec2]:
+    """Focal lengths and principal point [px], as the kernels take them."""
+    return [wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)]
+
+
+def projection(camera: Intrinsics, T_world_camera: np.ndarray) -> list[wp.mat44 | wp.vec2]:
+    """What brings world points into an image, as the kernels take it: T_camera_world of a pose (4, 4), and
+    `camera_vectors`.
+    """
+    return [wp.mat44(np.linalg.inv(T_world_camera).astype(np.float32)), *camera_vectors(camera)]

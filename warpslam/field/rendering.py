@@ -1,0 +1,92 @@
+"""Whole images of the map: depth, colour and variance (Eq. 5-7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warpslam.camera import Intrinsics
+from warpslam.config import SamplingConfig
+from warpslam.field.arrays import FieldArrays
+from warpslam.field.ray_batch import RayBatch
+from warpslam.poses import vector_from_pose
+from warpslam.runtime.phases import phase
+
+RAYS_PER_CHUNK = 8192
+FIRST_PASS_SAMPLES = 128
+FIRST_PASS_OCCUPANCY = 0.3
+
+
+@dataclass(frozen=True)
+class RenderedImage:
+    """A view of the map.
+
+    depth: z-depth [m], float32 (H, W). rgb: Colour in [0, 1], float32 (H, W, 3). variance: Of the depth [m^2], float32
+    (H, W).
+    """
+
+    depth: np.ndarray
+    rgb: np.ndarray
+    variance: np.ndarray
+
+
+@phase("rendering")
+def render_image(
+    arrays: FieldArrays,
+    camera: Intrinsics,
+    T_world_camera: np.ndarray,
+    sampling: SamplingConfig,
+    device: wp.Device,
+    *,
+    depth: np.ndarray | None = None,
+    stride: int = 1,
+) -> RenderedImage:
+    """Render the view from ``T_world_camera``, every ``stride``-th pixel.
+
+    With a ``depth`` image (H, W) [m], samples are placed around it as in mapping. Without one, a first pass spreads
+    its samples
+    evenly over the map, and the depth it finds places those of the second: nothing but the map enters.
+    """
+    if depth is None:
+        coarse = _render(arrays, camera, T_world_camera, sampling, device, None, stride)
+        depth = coarse.depth
+    else:
+        depth = np.ascontiguousarray(depth[::stride, ::stride], np.float32)
+    return _render(arrays, camera, T_world_camera, sampling, device, depth, stride)
+
+
+def _render(
+    arrays: FieldArrays,
+    camera: Intrinsics,
+    T_world_camera: np.ndarray,
+    sampling: SamplingConfig,
+    device: wp.Device,
+    depth: np.ndarray | None,
+    stride: int,
+) -> RenderedImage:
+    width = -(-camera.width // stride)
+    height = -(-camera.height // stride)
+    rows = max(1, RAYS_PER_CHUNK // width)
+    guided = depth is not None
+    stratified = sampling.stratified if guided else FIRST_PASS_SAMPLES
+    batch = RayBatch(rows * width, max(stratified, sampling.stratified + sampling.surface), device)
+    pose = wp.array(vector_from_pose(T_world_camera)[None].astype(np.float32), dtype=float, device=device)
+    out = RenderedImage(*(np.zeros((height, width, *c), np.float32) for c in ((), (3,), ())))
+    for first in range(0, height, rows):
+        count = min(rows, height - first)
+        batch.set_pixels(first, count, camera, stride)
+        batch.cast(pose)
+        if guided:
+            batch.measured_depth[: batch.count].assign(depth[first : first + count].reshape(-1))
+        batch.bound(arrays, use_depth=guided)
+        batch.place_samples(stratified, sampling.surface, use_depth=guided)
+        batch.render(arrays, "color" if guided else "fine")
+        if not guided:
+            # A mean between two surfaces would send the second pass's samples to where nothing is.
+            batch.take_surface_depth(FIRST_PASS_OCCUPANCY)
+        for image, array in ((out.depth, batch.depth), (out.rgb, batch.rgb), (out.variance, batch.variance)):
+            image[first : first + count] = array.numpy()[: batch.count].reshape(count, width, *image.shape[2:])
+    np.clip(out.rgb, 0.0, 1.0, out=out.rgb)
+    return out

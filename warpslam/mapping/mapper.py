@@ -1,0 +1,372 @@
+"""Mapping (Sec. 3.3): staged optimisation of the grids over a window of frames, Eq. 8-10, with local bundle
+adjustment.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from warpslam.camera import Intrinsics
+from warpslam.config import MappingConfig, SamplingConfig
+from warpslam.field.arrays import Gradients, Thresholds
+from warpslam.field.ray_batch import STAGES, RayBatch
+from warpslam.field.seeds import ray_seed
+from warpslam.mapping.active_sampling import CellErrors
+from warpslam.mapping.depth_start import DepthStart
+from warpslam.mapping.frustum import mark_seen, select_in_frustum
+from warpslam.poses import pose_from_vector, vector_from_pose
+from warpslam.runtime.launching import Launcher
+from warpslam.runtime.phases import phase
+from warpslam.scene.feature_grid import LEVELS
+from warpslam.scene.image_pool import ImagePool
+from warpslam.scene.keyframes import Keyframe, overlap_fractions
+from warpslam.scene.optimizers import ColorDecoderOptimizer, GridOptimizer, PoseOptimizer
+from warpslam.scene.scene_map import SceneMap
+
+# What each stage optimises, and at which of the configured rates (SPEC of the released code, learning rates by stage).
+_STAGE_LEVELS = {
+    "coarse": ("coarse",),
+    "middle": ("middle",),
+    "fine": ("middle", "fine"),
+    "color": ("middle", "fine", "color"),
+}
+
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass
+class MappingResult:
+    """Outcome of one mapping call.
+
+    vector: Pose vector of the current frame, refined if bundle adjustment ran.
+    losses: Mean loss per kept ray in the last iteration of each stage.
+    window: Frame numbers of the keyframes that took part.
+    adjusted: Whether poses were refined.
+    """
+
+    vector: np.ndarray
+    losses: dict[str, float] = field(default_factory=dict)
+    window: list[int] = field(default_factory=list)
+    adjusted: bool = False
+
+
+class Mapper:
+    """Optimises a `SceneMap` from the current frame and selected keyframes.
+
+    scene: The map it optimises.
+    """
+
+    def __init__(
+        self,
+        scene: SceneMap,
+        camera: Intrinsics,
+        config: MappingConfig,
+        sampling: SamplingConfig,
+        device: wp.Device,
+        seed: int,
+    ) -> None:
+        self.scene, self.camera, self.config, self.sampling = scene, camera, config, sampling
+        self.device, self.seed = device, seed
+        self._launcher = Launcher(device)
+        self._grids = {level: GridOptimizer(self._launcher) for level in LEVELS}
+        self._decoder = ColorDecoderOptimizer(self._launcher)
+        # Refinement doubles the window; the last keyframe and the current frame come on top.
+        frame_count = 2 * config.window + 2
+        self._poses = PoseOptimizer(frame_count, self._launcher)
+        samples = sampling.stratified + sampling.surface
+        self._batch = RayBatch(config.pixels, samples, device, self._launcher)
+        self._losses = wp.zeros(len(STAGES), dtype=float, device=device)
+        self._errors: CellErrors | None = None
+        if config.active_share > 0:
+            self._errors = CellErrors(frame_count, config.active_share, sampling, device, self._launcher)
+        self._changed: set[str] = set()
+        self._depth_start: DepthStart | None = None
+        if config.depth_start and config.optimize_middle:
+            self._depth_start = DepthStart(scene.decoder_weights.middle, scene.grids["middle"].spacing)
+        wanted = {"middle": config.optimize_middle, "fine": config.optimize_fine}
+        self._frozen = {level for level, is_optimized in wanted.items() if not is_optimized}
+
+    def map_first(
+        self, images: ImagePool, frame: int, vector: np.ndarray, on_iteration: Callable | None = None
+    ) -> MappingResult:
+        """The first frame: many iterations at higher rates."""
+        return self.start_first(images, frame, vector, on_iteration)()
+
+    def map_frame(self, images: ImagePool, frame: int, vector: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
+        """A later frame: window, frustum selection, three stages, bundle adjustment once there are enough keyframes."""
+        return self.start_frame(images, frame, vector, keyframes)()
+
+    def start_first(
+        self, images: ImagePool, frame: int, vector: np.ndarray, on_iteration: Callable | None = None
+    ) -> Callable[[], MappingResult]:
+        """`map_first` without waiting for the device: the function that is returned waits, and reads the outcome."""
+        config = self.config
+        return self._optimize(
+            images, frame, vector, [], config.first_iterations, config.first_rate_factor, on_iteration=on_iteration
+        )
+
+    def start_frame(
+        self, images: ImagePool, frame: int, vector: np.ndarray, keyframes: list[Keyframe]
+    ) -> Callable[[], MappingResult]:
+        """`map_frame` without waiting for the device: the function that is returned waits, and reads the outcome."""
+        return self._optimize(images, frame, vector, keyframes, self.config.iterations, 1.0)
+
+    def refine(
+        self,
+        images: ImagePool,
+        frame: int,
+        vector: np.ndarray,
+        keyframes: list[Keyframe],
+        rounds: range,
+    ) -> MappingResult:
+        """Final colour refinement: a doubled window, all vertices, colour stage only, colour decoder fixed, several
+        rounds, whose numbers are part of the seeds.
+        """
+        result = MappingResult(vector)
+        for round_ in rounds:
+            result = self._optimize(
+                images, frame, result.vector, keyframes, self.config.iterations, 1.0, refinement=True, round_=round_
+            )()
+        return result
+
+    def changed_rows(self) -> dict[str, wp.array]:
+        """Rows of each level that the last call may have changed, int (n,); levels it left alone are absent."""
+        return {level: self._grids[level].rows for level in self._changed}
+
+    # -- one call ------------------------------------------------------------------------------------------------
+
+    def _optimize(
+        self,
+        images: ImagePool,
+        frame: int,
+        vector: np.ndarray,
+        keyframes: list[Keyframe],
+        iterations: int,
+        rate_factor: float,
+        *,
+        refinement: bool = False,
+        round_: int = 0,
+        on_iteration: Callable | None = None,
+    ) -> Callable[[], MappingResult]:
+        """Launch a whole call; what is returned reads its outcome."""
+        config = self.config
+        rng = np.random.default_rng([self.seed, 2, frame, round_])
+        size = config.window * (2 if refinement else 1)
+        window = self._choose_window(images, vector, keyframes, size, rng)
+        coarse = self._choose_coarse_window(keyframes, rng) if config.coarse and not refinement else []
+        adjust = (
+            config.bundle_adjustment
+            and config.bundle_adjustment_rate > 0
+            and len(keyframes) >= config.bundle_adjustment_keyframes
+        )
+        # The oldest keyframe holds the window in place: it comes first, and its pose stays.
+        window.sort(key=lambda keyframe: keyframe.index)
+        rates = np.full((1, 2), config.bundle_adjustment_rate)
+        self._poses.begin(np.stack([*(keyframe.pose for keyframe in window), vector]), rates)
+        # Both windows at once: they must be on the device together.
+        in_use = images.bring([keyframe.image for keyframe in (*window, *coarse)])
+        slots = wp.array([*in_use[: len(window)], 0], dtype=int, device=self.device)
+        T_world_camera = pose_from_vector(vector)
+        self._select(images, T_world_camera, everything=refinement)
+        ray_counts: dict[str, int] = {}
+        self._launcher.forget()
+
+        if config.coarse and not refinement:
+            coarse_slots = wp.array([*in_use[len(window) :], 0], dtype=int, device=self.device)
+            poses = np.stack([*(keyframe.pose for keyframe in coarse), vector]).astype(np.float32)
+            coarse_poses = wp.array(poses, dtype=float, device=self.device)
+            count = config.first_iterations if not keyframes and rate_factor != 1.0 else config.coarse_iterations
+            self._run_coarse(images, frame, coarse_slots, coarse_poses, count, rate_factor)
+            self._note_loss("coarse", ray_counts)
+
+        stages = self._schedule(iterations, refinement)
+        self._batch.set_seeds([ray_seed(self.seed, 3, frame, n, round_) for n in range(len(stages))])
+        for iteration, stage in enumerate(stages):
+            if self._errors is not None and (iteration == 0 or stage != stages[iteration - 1]):
+                seed = ray_seed(self.seed, 5, frame, iteration, round_)
+                self._errors.measure(self.scene.arrays(), images.arrays, slots, self._poses.poses, self.camera, seed)
+
+            def iterate(stage: str = stage) -> None:
+                self._iterate(images, slots, T_world_camera, stage, rate_factor, adjust, refinement)
+
+            self._launcher.iterate(stage, (), iterate)
+            last_of_stage = iteration + 1 == len(stages) or stages[iteration + 1] != stage
+            if last_of_stage:
+                self._note_loss(stage, ray_counts)
+            if on_iteration is not None:
+                on_iteration(stage, iteration, len(stages))
+        self._changed = {level for stage in ray_counts for level in _STAGE_LEVELS[stage]}
+
+        def outcome() -> MappingResult:
+            for name, optimizer in (*self._grids.items(), ("colour decoder", self._decoder)):
+                if optimizer.has_rejected:
+                    _log.warning("frame %d: gradients of the %s were not finite and have been left out", frame, name)
+            result = MappingResult(vector, window=[keyframe.index for keyframe in window], adjusted=adjust)
+            losses = self._losses.numpy()
+            result.losses = {s: float(losses[STAGES.index(s)]) / max(count, 1) for s, count in ray_counts.items()}
+            if adjust:
+                vectors = self._poses.vectors()
+                for keyframe, refined in zip(window[1:], vectors[1:-1], strict=True):
+                    keyframe.pose = _normalized(refined)
+                result.vector = _normalized(vectors[-1])
+            return result
+
+        return outcome
+
+    def _schedule(self, iterations: int, refinement: bool) -> list[str]:
+        """Stage of each iteration; both comparisons are inclusive, as in the released code."""
+        if refinement:
+            return ["color"] * iterations
+        middle, fine = int(self.config.middle_share * iterations), int(self.config.fine_share * iterations)
+        # Without middle features to optimise the first stage is the one that optimises fine ones.
+        first = "middle" if self.config.optimize_middle else "fine"
+        return [first if j <= middle else "fine" if j <= fine else "color" for j in range(iterations)]
+
+    @phase("keyframe selection")
+    def _choose_window(
+        self, images: ImagePool, vector: np.ndarray, keyframes: list[Keyframe], size: int, rng: np.random.Generator
+    ) -> list[Keyframe]:
+        """Up to ``size`` - 2 keyframes that see what the current frame sees (or random ones), and the last keyframe."""
+        if not keyframes or size < 2:
+            return []
+        *candidates, last = keyframes
+        if self.config.selection == "overlap" and candidates:
+            fractions = overlap_fractions(
+                images.depth_image(0),
+                pose_from_vector(vector),
+                [pose_from_vector(keyframe.pose) for keyframe in candidates],
+                self.camera,
+                rng,
+            )
+            candidates = [keyframe for keyframe, fraction in zip(candidates, fractions, strict=True) if fraction > 0]
+        order = rng.permutation(len(candidates))[: max(size - 2, 0)]
+        return [*(candidates[n] for n in order), last]
+
+    def _select(self, images: ImagePool, T_world_camera: np.ndarray, *, everything: bool) -> None:
+        """Which vertices of each level may change during this call; and note those that the frame has measured."""
+        depth = wp.array(images.depth_image(0), dtype=float, device=self.device)
+        for level, optimizer in self._grids.items():
+            grid = self.scene.grids[level]
+            if level in self._frozen:
+                mask = np.zeros(grid.row_count, bool)
+            elif level == "coarse" or everything or not self.config.frustum_selection:
+                mask = np.ones(grid.row_count, bool)
+            else:
+                mask = select_in_frustum(
+                    grid.lattice, grid.shape, self.camera, T_world_camera, depth, self.config.frustum_margin
+                )
+            optimizer.begin(grid, mask)
+            if level == "middle" and self._depth_start is not None and not everything:
+                self._depth_start.apply(grid, self.camera, T_world_camera, depth, optimizer.selected)
+        mark_seen(self.scene.grids["color"], self.camera, T_world_camera, depth)
+        self._decoder.begin()
+
+    def _iterate(
+        self,
+        images: ImagePool,
+        slots: wp.array,
+        T_world_camera: np.ndarray,
+        stage: str,
+        rate_factor: float,
+        adjust: bool,
+        refinement: bool,
+    ) -> None:
+        """One iteration of a stage; nothing in it may depend on the iteration's number, because it is replayed.
+
+        T_world_camera: Of the current frame, before bundle adjustment (4, 4).
+        """
+        config, batch, arrays = self.config, self._batch, self.scene.arrays()
+        color = stage == "color"
+        train_decoder = color and config.train_color_decoder and not refinement
+        gradients = Gradients(
+            grids={level: self._grids[level].wanted() for level in _STAGE_LEVELS[stage]},
+            points=adjust and color,
+            inliers_move=config.bundle_adjustment_filter > 0,
+            color_weights=self._decoder.gradient if train_decoder else None,
+        )
+        sampling = self.sampling
+        active = self._errors.active if self._errors is not None else None
+        with self._launcher.tape() as tape:
+            batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera, active=active)
+            batch.cast(self._poses.poses, differentiate=gradients.points)
+            batch.bound(arrays)
+            current = slots.shape[0] - 1
+            if config.moved_margin > 0 and current > 0:
+                batch.drop_contradicted(images.arrays, current, T_world_camera, self.camera, config.moved_margin)
+            batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)
+            scale = 1.0 / batch.count if config.loss == "mean" else 1.0
+            thresholds = Thresholds(sampling.min_weight, sampling.min_gradient * scale, sampling.min_transmittance)
+            batch.render(arrays, stage, gradients, tape, thresholds=thresholds)
+            if gradients.points and gradients.inliers_move:
+                batch.choose_inliers(config.bundle_adjustment_filter, normalized=False)
+            batch.mapping_loss(config.color_weight * scale if color else 0.0, scale)
+        self._launcher.call(partial(tape.backward, batch.loss))
+        rates = {
+            "middle": config.middle_rate if stage == "middle" else config.geometry_rate,
+            "fine": config.geometry_rate,
+            "color": config.color_rate,
+        }
+        for level in _STAGE_LEVELS[stage]:
+            self._grids[level].update(self.scene.grids[level].features, rates[level] * rate_factor)
+        if train_decoder:
+            self._decoder.update_decoder(self.scene.decoders["color"], config.color_rate * rate_factor)
+        if adjust and color:
+            # Moments start in the colour stage: the earlier stages never ask for pose gradients.
+            self._poses.update(first=1)
+        batch.next_iteration()
+
+    # -- the coarse level (Sec. 3.1; in the released code it serves forecasts only) -------------------------------
+
+    def _choose_coarse_window(self, keyframes: list[Keyframe], rng: np.random.Generator) -> list[Keyframe]:
+        """Random keyframes from all but the last, and the last one."""
+        if not keyframes:
+            return []
+        *others, last = keyframes
+        return [*(others[n] for n in rng.permutation(len(others))[: max(self.config.window - 2, 0)]), last]
+
+    def _run_coarse(
+        self,
+        images: ImagePool,
+        frame: int,
+        slots: wp.array,
+        poses: wp.array,
+        iterations: int,
+        rate_factor: float,
+    ) -> None:
+        """Coarse stage: no depth guidance, depth loss only, all vertices."""
+        config, batch, arrays, sampling = self.config, self._batch, self.scene.arrays(), self.sampling
+        optimizer = self._grids["coarse"]
+        gradients = Gradients(grids={"coarse": optimizer.wanted()})
+
+        def iterate() -> None:
+            with self._launcher.tape() as tape:
+                batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera)
+                batch.cast(poses)
+                batch.bound(arrays, use_depth=False)
+                batch.place_samples(sampling.stratified, 0, use_depth=False, jitter=sampling.jitter)
+                batch.render(arrays, "coarse", gradients, tape)
+                batch.mapping_loss(0.0, 1.0 / batch.count if config.loss == "mean" else 1.0)
+            self._launcher.call(partial(tape.backward, batch.loss))
+            optimizer.update(self.scene.grids["coarse"].features, config.coarse_rate * rate_factor)
+            batch.next_iteration()
+
+        batch.set_seeds([ray_seed(self.seed, 4, frame, n) for n in range(iterations)])
+        for _ in range(iterations):
+            self._launcher.iterate("coarse", (), iterate)
+
+    def _note_loss(self, stage: str, ray_counts: dict[str, int]) -> None:
+        """Keep the loss of the last iteration on the device until the end of the call."""
+        ray_counts[stage] = self._batch.count
+        wp.copy(self._losses, self._batch.loss, dest_offset=STAGES.index(stage), count=1)
+
+
+def _normalized(vector: np.ndarray) -> np.ndarray:
+    """Pose vector with a unit quaternion: Adam moves its length freely, which changes nothing but the step sizes."""
+    return vector_from_pose(pose_from_vector(vector))

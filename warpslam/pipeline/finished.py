@@ -1,0 +1,183 @@
+"""What can be done with a run folder afterwards: errors, renderings, another mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warpslam.errors import DatasetError, InputError
+from warpslam.evaluation import (
+    DEFAULT_PROTOCOL,
+    evaluate_mesh,
+    load_mesh,
+    reconstruction_metrics,
+    rendering_metrics,
+    trajectory_metrics,
+)
+from warpslam.pipeline.results import render_panel
+from warpslam.pipeline.setup import load_slam
+from warpslam.runs.folder import RunFolder
+from warpslam.runs.request import Source
+from warpslam.storage.json_files import read_json
+from warpslam.storage.tum import associate, read_tum
+
+if TYPE_CHECKING:
+    import trimesh
+
+    from warpslam.sequences.base import RgbdSequence
+
+
+def open_source(source: Source) -> RgbdSequence:
+    """Open the input of a run again.
+
+    Raises:
+        DatasetError: The folder is gone or can't be read any more.
+    """
+    if source.path is None:
+        from warpslam.synthetic.demo import demo_sequence
+
+        return demo_sequence()
+    from warpslam.sequences import open_sequence
+
+    return open_sequence(source.path, dataset=source.dataset, camera=source.camera)
+
+
+def evaluate_run(
+    folder: RunFolder,
+    truth: str | Path | None = None,
+    *,
+    max_difference: float = 0.02,
+    truth_mesh: str | Path | None = None,
+    protocols: Sequence[str] = (DEFAULT_PROTOCOL,),
+    rendered_views: int = 0,
+    device: str | None = None,
+) -> dict[str, Any]:
+    """Errors of a run, under the names of metrics.json.
+
+    Args:
+        folder: Run.
+        truth: Trajectory in the TUM format; None for the ground truth that came with the sequence.
+        max_difference: Largest difference in time of an estimated and a true pose [s].
+        truth_mesh: True surface to compare the mesh with.
+        protocols: Culling protocols of that comparison, of `warpslam.evaluation.PROTOCOLS`. The figures of the first
+            are "reconstruction"; those of all are "reconstruction_by_protocol" if there are several.
+        rendered_views: Frames, evenly spread, that are rendered from the map at their estimated poses, in full, and
+            compared with what the camera saw; slow without a GPU.
+        device: Warp device.
+
+    Raises:
+        ConfigError: There is no such protocol or device.
+        DatasetError: A file is missing or damaged, or no pose has a partner.
+        MeshError: A mesh can't be read or has nothing in view.
+    """
+    times, poses = read_tum(folder.require(folder.trajectory, "the run stopped before its first frame"))
+    truth = truth or folder.require(folder.ground_truth, "its sequence has no ground truth; name one with --truth")
+    truth_times, truth_poses = read_tum(truth)
+    partner = associate(times, truth_times, max_difference)
+    paired = partner >= 0
+    if not paired.any():
+        raise DatasetError(
+            f"{truth}: none of its {len(truth_times)} times is within {max_difference} s of a frame; "
+            "is it the same sequence, in seconds?"
+        )
+    metrics: dict[str, Any] = {"frames": {"estimated": len(times), "compared": int(paired.sum())}}
+    metrics.update(trajectory_metrics(poses[paired], truth_poses[partner[paired]]))
+    if truth_mesh is not None:
+        # What counts is decided at true poses, as in the run: a wrong trajectory must not choose what it is judged by.
+        known = np.where(paired[:, None, None], truth_poses[partner], poses)
+        mesh = folder.require(folder.mesh, "see metrics.json for why the run made none")
+        sequence, indices = open_source(folder.read_source()), _frame_indices(folder, len(times))
+        results = evaluate_mesh(
+            mesh, load_mesh(truth_mesh), sequence, indices, known, protocols=protocols, device=device
+        )
+        by_protocol = {name: reconstruction_metrics(result) for name, result in results.items()}
+        metrics["reconstruction"] = by_protocol[protocols[0]]
+        if len(by_protocol) > 1:
+            metrics["reconstruction_by_protocol"] = by_protocol
+    if rendered_views > 0:
+        metrics["rendering"] = _rendering_metrics(folder, poses, rendered_views, device)
+    return metrics
+
+
+def _rendering_metrics(folder: RunFolder, poses: np.ndarray, count: int, device: str | None) -> dict[str, Any]:
+    slam, sequence = load_slam(folder, device), open_source(folder.read_source())
+    indices = _frame_indices(folder, len(poses))
+    chosen = np.unique(np.linspace(0, len(poses) - 1, count).round().astype(int))
+    return rendering_metrics([render_panel(slam, sequence[indices[n]], poses[n]) for n in chosen])
+
+
+def render_frame(folder: RunFolder, index: int, output: str | Path | None = None, device: str | None = None) -> Path:
+    """Write a frame of the sequence beside what the final map renders at its estimated pose, as PNG.
+
+    Args:
+        folder: Run.
+        index: Number of the frame in its sequence; the run must have used it.
+        output: File to write; None for ``render_<index>.png`` in the run folder.
+        device: Warp device.
+
+    Raises:
+        InputError: The run has no pose for the frame.
+        DatasetError: The input or a file of the run is missing.
+    """
+    from warpslam.report.plots import plot_panels
+
+    _, poses = read_tum(folder.require(folder.trajectory, "the run stopped before its first frame"))
+    sequence = open_source(folder.read_source())
+    if not 0 <= index < len(sequence):
+        raise InputError(f"frame {index} is not in {sequence.name}, which has frames 0 to {len(sequence) - 1}")
+    used = _frame_indices(folder, len(poses))
+    if index not in used:
+        raise InputError(f"frame {index} was not used by the run {folder.path}, so it has no pose; choose another one")
+    path = Path(output) if output is not None else folder.path / f"render_{index:06d}.png"
+    plot_panels(path, [render_panel(load_slam(folder, device), sequence[index], poses[used.index(index)])])
+    return path
+
+
+def extract_mesh(
+    folder: RunFolder,
+    voxel: float | None = None,
+    output: str | Path | None = None,
+    device: str | None = None,
+    *,
+    forecast: bool = False,
+    refinement_rounds: int = 0,
+) -> tuple[trimesh.Trimesh, Path]:
+    """Extract the mesh of the final map and write it. The map itself stays as the run left it.
+
+    Args:
+        folder: Run.
+        voxel: Edge of a marching-cubes cell [m]; None for the setting of the run.
+        output: File to write, .ply or .glb; None for mesh.ply in the run folder, mesh_forecast.ply with a forecast.
+        device: Warp device.
+        forecast: Add what the coarse level suggests where nothing was seen, in cyan.
+        refinement_rounds: Rounds of the global refinement before that.
+
+    Raises:
+        DatasetError: The run saved no map.
+        InputError: The map can't be refined.
+        MeshError: There is no surface, or the file can't be written.
+    """
+    from warpslam.meshing import check_mesh_path, write_mesh
+
+    path = check_mesh_path(output if output is not None else folder.forecast_mesh if forecast else folder.mesh)
+    slam = load_slam(folder, device)
+    if refinement_rounds > 0:
+        slam.refine(refinement_rounds)
+    settings: dict[str, Any] = {} if voxel is None else {"voxel": voxel}
+    mesh = slam.mesh(**settings, forecast=True) if forecast else slam.mesh(**settings)
+    return mesh, write_mesh(mesh, path)
+
+
+def _frame_indices(folder: RunFolder, count: int) -> list[int]:
+    """Number in its sequence of each of the ``count`` frames in trajectory.tum."""
+    timing = read_json(folder.require(folder.timing, "so it is unknown which frames it used"))
+    try:
+        indices = [int(frame["index"]) for frame in timing["frames"]]
+    except (KeyError, TypeError, ValueError) as error:
+        raise DatasetError(f"{folder.timing}: expected frames with an index each ({error!r})") from error
+    if len(indices) != count:
+        raise DatasetError(f"{folder.timing} has {len(indices)} frames and {folder.trajectory.name} {count}; run again")
+    return indices

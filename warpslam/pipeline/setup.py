@@ -1,0 +1,138 @@
+"""What a run starts with: its frames, its device and kernels, its method, a map, and poses that are given to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from warpslam.errors import ConfigError, InputError
+from warpslam.pipeline.methods import DEFAULT_METHOD, build_method, check_method, has_checkpoints, load_method
+from warpslam.runs.folder import RunFolder
+from warpslam.storage.json_files import read_json
+
+if TYPE_CHECKING:
+    from warpslam.camera import Intrinsics
+    from warpslam.config import Config
+    from warpslam.pipeline.methods import Method
+    from warpslam.runtime.compilation import ModuleProgress
+    from warpslam.sequences.base import RgbdSequence
+    from warpslam.slam import Slam
+
+
+def select_frames(sequence: RgbdSequence, frames: slice | None) -> range:
+    """Numbers of the frames to use, all by default.
+
+    Raises:
+        ConfigError: The slice selects none, or goes backwards.
+    """
+    frames = slice(None) if frames is None else frames
+    if frames.step is not None and frames.step < 1:
+        raise ConfigError(f"frames: step {frames.step} must be at least 1; SLAM goes forward in time")
+    selected = range(*frames.indices(len(sequence)))
+    if len(selected) == 0:
+        wanted = ":".join("" if part is None else str(part) for part in (frames.start, frames.stop, frames.step))
+        raise ConfigError(f"frames {wanted} selects none of the {len(sequence)} frames of {sequence.name}")
+    return selected
+
+
+def check_checkpoint_settings(every: int | None, map_path: str | Path | None, localize_only: bool, method: str) -> None:
+    """Refuse settings of checkpoints and maps that do not go together.
+
+    Raises:
+        ConfigError: Names them.
+    """
+    check_method(method)
+    if not has_checkpoints(method) and (every is not None or map_path is not None):
+        raise ConfigError(f"method {method} has no checkpoints and takes no map: leave out checkpoint_every and map")
+    if every is not None and every < 1:
+        raise ConfigError(f"checkpoint_every = {every} must be at least 1 frame")
+    if localize_only and map_path is None:
+        raise ConfigError("localize_only needs a map: name one with map_path (--map)")
+
+
+def check_device(device: str | None) -> None:
+    """Whether Warp has the device of that name; None is Warp's preferred one.
+
+    Raises:
+        ConfigError: It has not.
+    """
+    import warp as wp
+
+    names = [str(known) for known in wp.get_devices()]
+    if device is not None and device not in (*names, "cuda"):
+        raise ConfigError(f"device {device!r} is not there; this machine has {', '.join(names)}")
+
+
+def device_name(device: str | None) -> str:
+    """The device that a name, or none, leads to; a name that leads nowhere is told of when the run starts."""
+    import warp as wp
+
+    names = [str(known) for known in wp.get_devices()]
+    return str(wp.get_device(device)) if device is None or device in (*names, "cuda") and names[1:] else str(device)
+
+
+def load_kernels(
+    sequence: RgbdSequence, device: str | None, report: Callable[[ModuleProgress], None] | None = None
+) -> list[ModuleProgress]:
+    """Load all kernels that a run over ``sequence`` needs, compiling those that never were; see
+    `warpslam.runtime.compilation.compile_kernels`.
+
+    Raises:
+        ConfigError: There is no such device.
+    """
+    import warp as wp
+
+    from warpslam.runtime.compilation import compile_kernels
+
+    check_device(device)
+    return compile_kernels(wp.get_device(device), report, getattr(sequence, "warp_modules", ()))
+
+
+def build_slam(intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Method:
+    """The SLAM object of a run.
+
+    Raises:
+        ConfigError: There is no such device.
+        CheckpointError: The decoders can't be loaded.
+    """
+    return build_baseline(DEFAULT_METHOD, intrinsics, config, device, seed)
+
+
+def build_baseline(method: str, intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Method:
+    """Any method of a run, by name; see `warpslam.pipeline.methods.build_method` for what it raises."""
+    check_device(device)
+    return build_method(method, intrinsics, config, device, seed)
+
+
+def open_map(
+    path: str | Path, intrinsics: Intrinsics, config: Config, device: str | None, *, localize_only: bool = False
+) -> Slam:
+    """The SLAM object of a run that starts from a map.
+
+    Raises:
+        ConfigError: There is no such device, or the settings do not fit the map.
+        CheckpointError: The map can't be loaded.
+        InputError: The map was made with another camera.
+    """
+    from warpslam.slam import Slam
+
+    check_device(device)
+    slam = Slam.load(path, device, config=config, localize_only=localize_only)
+    if slam.intrinsics != intrinsics:
+        raise InputError(f"{path} was made with another camera: {slam.intrinsics}, the sequence has {intrinsics}")
+    slam.forget_pose()
+    return slam
+
+
+def load_slam(folder: RunFolder, device: str | None = None) -> Method:
+    """The SLAM object (or the baseline) as a run left it.
+
+    Raises:
+        ConfigError: There is no such device.
+        DatasetError: The run saved no map.
+        CheckpointError: The map can't be loaded.
+    """
+    path = folder.require(folder.map, "the run stopped before it had a map")
+    check_device(device)
+    return load_method(read_json(folder.metrics).get("method", DEFAULT_METHOD), path, device)

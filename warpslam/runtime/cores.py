@@ -1,0 +1,33 @@
+"""CPU cores of this process, and into how many slices they cut a launch."""
+
+from __future__ import annotations
+
+import os
+from functools import lru_cache
+
+import warp as wp
+
+from warpslam.errors import ConfigError
+
+MAX_SLICES = 8
+
+
+def slice_count(device: wp.Device) -> int:
+    """Slices of a launch over rays, which is also the number of gradient buffers: the CPU's cores (at most 8), 1 on
+    CUDA.
+    """
+    if device.is_cuda:
+        return 1
+    return max(1, min(_core_count(), MAX_SLICES))
+
+
+@lru_cache(maxsize=1)
+def _core_count() -> int:
+    """Cores that this process may use; fewer where several share a machine and WARPSLAM_THREADS says so."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    text = os.environ.get("WARPSLAM_THREADS", "")
+    if not text:
+        return cores
+    if not text.isdecimal() or int(text) < 1:
+        raise ConfigError(f"environment variable WARPSLAM_THREADS = {text!r} must be a whole number from 1 on")
+    return min(cores, int(text))

@@ -1,0 +1,89 @@
+"""One level of the map (Sec. 3.1): features at the vertices of a lattice that grows."""
+
+from __future__ import annotations
+
+import numpy as np
+import warp as wp
+
+from warpslam.kernels import grid as grid_kernels
+from warpslam.kernels.grid import Lattice, Vec32
+
+LEVELS = ("coarse", "middle", "fine", "color")
+
+
+class FeatureGrid:
+    """One level: features on the vertices ``spacing * (first + index)`` of the world lattice.
+
+    first: World lattice index of vertex 0, int64 (3,).
+    shape: Vertices per axis.
+    features: Array of `Vec32`, one row a vertex (`warpslam.kernels.grid.row_of`).
+    seen: 1 where a mapped frame has measured what is at a vertex, uint8 (rows,): of the colour level, which tracking
+        goes by (`RayBatch.drop_unseen`), and of the middle one, where `warpslam.mapping.depth_start` started it.
+    """
+
+    def __init__(self, level: str, spacing: float, std: float, seed: int, device: wp.Device) -> None:
+        self.level, self.spacing, self.std, self.seed, self.device = level, spacing, std, seed, device
+        self.first = np.zeros(3, np.int64)
+        self.shape = (0, 0, 0)
+        self.features = wp.zeros(1, dtype=Vec32, device=device)
+        self.seen = wp.zeros(1, dtype=wp.uint8, device=device)
+        self.lattice = self._lattice()
+
+    @property
+    def row_count(self) -> int:
+        """Vertices of the grid."""
+        return int(np.prod(self.shape))
+
+    def cover(self, low: np.ndarray, high: np.ndarray) -> bool:
+        """Grow to hold every vertex of the cells between ``low`` and ``high`` [m]; features stay. True if it grew."""
+        first = np.floor(low / self.spacing + 1e-6).astype(np.int64)
+        last = np.ceil(high / self.spacing - 1e-6).astype(np.int64)
+        last = np.maximum(last, first + 1)
+        if self.row_count:
+            first = np.minimum(first, self.first)
+            last = np.maximum(last, self.first + self.shape - 1)
+        shape = tuple(int(n) for n in last - first + 1)
+        if shape == self.shape:
+            return False
+        self._resize(first, shape)
+        return True
+
+    def _resize(self, first: np.ndarray, shape: tuple[int, int, int]) -> None:
+        old_lattice, old_features, old_seen = self.lattice, self.features, self.seen
+        shift = self.first - first
+        self.first, self.shape = first, shape
+        self.lattice = self._lattice()
+        self.features = wp.empty(self.row_count, dtype=Vec32, device=self.device)
+        self.seen = wp.empty(self.row_count, dtype=wp.uint8, device=self.device)
+        wp.launch(
+            grid_kernels.fill_grid,
+            dim=shape,
+            inputs=[self.lattice, wp.vec3i(*first), self.seed, LEVELS.index(self.level), self.std]
+            + [old_lattice, old_features, old_seen, wp.vec3i(*shift)],
+            outputs=[self.features, self.seen],
+            device=self.device,
+            record_tape=False,
+        )
+
+    def restore(self, first: np.ndarray, shape: tuple[int, int, int], features: np.ndarray, seen: np.ndarray) -> None:
+        """Put back a saved grid: ``features`` float32 (rows, 32), ``seen`` uint8 (rows,)."""
+        self.first, self.shape = np.asarray(first, np.int64), tuple(int(n) for n in shape)
+        self.lattice = self._lattice()
+        self.features = wp.array(np.ascontiguousarray(features, np.float32), dtype=Vec32, device=self.device)
+        self.seen = wp.array(np.ascontiguousarray(seen, np.uint8), dtype=wp.uint8, device=self.device)
+
+    def update_from(self, other: FeatureGrid, rows: wp.array | None) -> None:
+        """Take over the extent of another grid of this level, and some of its rows: int (n,), None for none."""
+        if other.shape != self.shape or (other.first != self.first).any():
+            self._resize(other.first, other.shape)
+        if rows is not None:
+            inputs = [rows, other.features, self.features]
+            wp.launch(grid_kernels.copy_rows, rows.shape[0], inputs, device=self.device, record_tape=False)
+            wp.copy(self.seen, other.seen)
+
+    def _lattice(self) -> Lattice:
+        lattice = Lattice()
+        lattice.origin = wp.vec3(*(self.first * self.spacing))
+        lattice.inverse_spacing = wp.vec3(1.0 / self.spacing, 1.0 / self.spacing, 1.0 / self.spacing)
+        lattice.shape = wp.vec3i(*self.shape)
+        return lattice

@@ -1,0 +1,181 @@
+"""RGB-D images of the frames in play: compact in host memory, in slots on the device."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warpslam.camera import Intrinsics
+from warpslam.errors import MapSizeError
+
+
+class ImagePool:
+    """RGB-D images: all of them compact and lossless in host memory, those in use on the device.
+
+    On the device an image lies in a slot: colour as uint8, depth as uint16 times a scale of its own, which keeps depth
+    to 1/131070 of the image's largest depth (0.04 mm at 5 m). Slot 0 is the current frame; the others are a cache of
+    the images that `bring` was asked for last. Which slot an image is in changes no result.
+
+    Args:
+        camera: Its image size.
+        device: Where the slots are.
+        max_gigabytes: The slots take no more than this [GB]; they start few and grow.
+    """
+
+    def __init__(self, camera: Intrinsics, device: wp.Device, max_gigabytes: float = np.inf, capacity: int = 8) -> None:
+        self.camera, self.device = camera, device
+        image_bytes = 5 * camera.height * camera.width
+        self.max_slots = int(min(max_gigabytes * 1e9 / image_bytes, 1 << 30))
+        self.images: list[CompactImage] = []
+        self._slot_of: dict[int, int] = {}  # by image, the one used longest ago first
+        self._allocate(max(min(capacity, self.max_slots), 1))
+
+    def _allocate(self, capacity: int) -> None:
+        shape = (capacity, self.camera.height, self.camera.width)
+        self.rgb = wp.zeros((*shape, 3), dtype=wp.uint8, device=self.device)
+        self.depth = wp.zeros(shape, dtype=wp.uint16, device=self.device)
+        self.scale = wp.zeros(capacity, dtype=float, device=self.device)
+
+    @property
+    def arrays(self) -> tuple[wp.array, wp.array, wp.array]:
+        """Colour (slots, H, W, 3), depth (slots, H, W) and its scale (slots,) as the kernels read them."""
+        return self.rgb, self.depth, self.scale
+
+    def fork(self) -> ImagePool:
+        """A pool with slots of its own that shares the kept images, also those added later: for another thread."""
+        other = ImagePool(self.camera, self.device, capacity=self.rgb.shape[0])
+        other.max_slots, other.images = self.max_slots, self.images
+        return other
+
+    def copy_current(self, other: ImagePool) -> None:
+        """Put into slot 0 what the other pool holds there."""
+        for target, source in zip(self.arrays, other.arrays, strict=True):
+            wp.copy(target, source, count=source.size // source.shape[0])
+
+    def set(self, slot: int, rgb: np.ndarray, depth: np.ndarray) -> None:
+        """Store an image: uint8 (H, W, 3) and float32 (H, W) [m]."""
+        self._write(slot, rgb, *_quantized(depth))
+
+    def add(self, rgb: np.ndarray, depth: np.ndarray) -> int:
+        """Keep an image for `bring`; returns its number."""
+        self.images.append(CompactImage.of(rgb, *_quantized(depth)))
+        return len(self.images) - 1
+
+    def bring(self, images: Sequence[int]) -> list[int]:
+        """Slots of some images, which are on the device until the next call.
+
+        Raises:
+            MapSizeError: they do not fit into the memory set for them.
+        """
+        wanted = list(dict.fromkeys(images))
+        if 1 + len(wanted) > self.max_slots:
+            raise MapSizeError(_too_many_images(self.camera, 1 + len(wanted), self.max_slots))
+        while 1 + len(self._slot_of.keys() | set(wanted)) > self.rgb.shape[0] < self.max_slots:
+            old = self.arrays
+            self._allocate(min(2 * self.rgb.shape[0], self.max_slots))
+            for source, target in zip(old, self.arrays, strict=True):
+                wp.copy(target, source, count=source.size)
+        for image in wanted:
+            slot = self._slot_of.pop(image, None)
+            if slot is None:
+                slot = self._free_slot(wanted)
+                self._write(slot, *self.images[image].unpack(self.camera))
+            self._slot_of[image] = slot
+        return [self._slot_of[image] for image in images]
+
+    def _free_slot(self, wanted: list[int]) -> int:
+        if 1 + len(self._slot_of) < self.rgb.shape[0]:
+            return 1 + len(self._slot_of)
+        return self._slot_of.pop(next(image for image in self._slot_of if image not in wanted))
+
+    def _write(self, slot: int, rgb: np.ndarray, depth: np.ndarray, scale: float) -> None:
+        self.rgb[slot].assign(np.ascontiguousarray(rgb))
+        self.depth[slot].assign(depth)
+        self.scale[slot : slot + 1].assign(np.array([scale], np.float32))
+
+    def depth_image(self, slot: int) -> np.ndarray:
+        """Depth [m], float32 (H, W)."""
+        return self.depth[slot].numpy().astype(np.float32) * self.scale.numpy()[slot]
+
+    def current(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """What slot 0 holds: colour, uint16 depth, and its scale."""
+        return self.rgb[0].numpy(), self.depth[0].numpy(), float(self.scale.numpy()[0])
+
+    def restore(self, current: tuple[np.ndarray, np.ndarray, float], images: list[CompactImage]) -> None:
+        """Put back what `current` and `images` were."""
+        self._write(0, *current)
+        self.images, self._slot_of = images, {}
+
+    @property
+    def device_bytes(self) -> int:
+        """Memory of the slots."""
+        return sum(array.capacity for array in self.arrays)
+
+    @property
+    def compact_bytes(self) -> int:
+        """Memory of the compact images."""
+        return sum(len(image.rgb) + len(image.depth) for image in self.images)
+
+
+def check_window_fits(camera: Intrinsics, max_gigabytes: float, window: int) -> None:
+    """Raise `MapSizeError` if images of two windows and the current frame do not fit into ``max_gigabytes``."""
+    slots = int(min(max_gigabytes * 1e9 / (5 * camera.height * camera.width), 1 << 30))
+    if slots < 1 + 2 * window:
+        raise MapSizeError(_too_many_images(camera, 1 + 2 * window, slots))
+
+
+def _too_many_images(camera: Intrinsics, needed: int, slots: int) -> str:
+    gigabytes = 5 * camera.height * camera.width / 1e9
+    return (
+        f"mapping needs {needed} images of {camera.width} x {camera.height} at a time, {needed * gigabytes:.4f} GB, "
+        f"and keyframes.max_gigabytes has room for {slots}: raise it, or lower mapping.window"
+    )
+
+
+@dataclass(frozen=True)
+class CompactImage:
+    """An image of the pool, compressed without loss: each value as the difference to its left neighbour, by zlib.
+
+    rgb, depth: Compressed differences; depth has the low bytes of all pixels first. scale: Metres per unit of depth.
+    """
+
+    rgb: bytes
+    depth: bytes
+    scale: float
+
+    @classmethod
+    def of(cls, rgb: np.ndarray, depth: np.ndarray, scale: float) -> CompactImage:
+        """From uint8 (H, W, 3) and uint16 (H, W)."""
+        differences = np.diff(depth, axis=1, prepend=np.uint16(0)).astype("<u2", copy=False)
+        planes = np.stack([differences & 0xFF, differences >> 8]).astype(np.uint8)
+        return cls(_deflated(np.diff(rgb, axis=1, prepend=np.uint8(0))), _deflated(planes), scale)
+
+    def unpack(self, camera: Intrinsics) -> tuple[np.ndarray, np.ndarray, float]:
+        """Colour uint8 (H, W, 3), depth uint16 (H, W), and scale, as they were."""
+        height, width = camera.height, camera.width
+        rgb = np.cumsum(_inflated(self.rgb, (height, width, 3)), axis=1, dtype=np.uint8)
+        low, high = _inflated(self.depth, (2, height, width)).astype(np.uint16)
+        return rgb, np.cumsum(low | high << 8, axis=1, dtype=np.uint16), self.scale
+
+
+def _deflated(array: np.ndarray) -> bytes:
+    return zlib.compress(array.tobytes(), 1)
+
+
+def _inflated(data: bytes, shape: tuple[int, ...]) -> np.ndarray:
+    size = int(np.prod(shape))
+    inflater = zlib.decompressobj()
+    # No more than the image needs, whatever the data say.
+    content = inflater.decompress(data, size)
+    if len(content) != size or inflater.decompress(inflater.unconsumed_tail, 1):
+        raise ValueError(f"a compressed image does not hold the {size} bytes of {shape}")
+    return np.frombuffer(content, np.uint8).reshape(shape)
+
+
+def _quantized(depth: np.ndarray) -> tuple[np.ndarray, float]:
+    scale = float(depth.max()) / 65535.0 or 1.0
+    return np.rint(depth / scale).astype(np.uint16), scale

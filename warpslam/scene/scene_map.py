@@ -1,0 +1,166 @@
+"""The map (Sec. 3.1): four feature grids on world-aligned lattices that grow, and the decoders that read them."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import warp as wp
+
+from warpslam.config import GridConfig
+from warpslam.errors import InputError, MapSizeError
+from warpslam.field.arrays import FieldArrays
+from warpslam.field.decoders import Decoders
+from warpslam.field.packing import PackedDecoder
+from warpslam.field.ray_batch import RayBatch
+from warpslam.runtime.cores import slice_count
+from warpslam.runtime.environment import free_gigabytes
+from warpslam.runtime.phases import phase
+from warpslam.scene.feature_grid import LEVELS, FeatureGrid
+
+QUERY_CHUNK = 1 << 16
+_log = logging.getLogger(__name__)
+
+
+class SceneMap:
+    """Occupancy and colour of everything seen so far.
+
+    bounds: ``low``, ``high``, float64 (3,) [m], multiples of the middle spacing. Nothing is known on or beyond them.
+    """
+
+    def __init__(self, decoders: Decoders, config: GridConfig, device: wp.Device, seed: int = 0) -> None:
+        self.config, self.device, self.decoder_weights, self.seed = config, device, decoders, seed
+        self.grids = {
+            level: FeatureGrid(
+                level, getattr(config, f"{level}_spacing"), getattr(config, f"{level}_std"), seed, device
+            )
+            for level in LEVELS
+        }
+        self.decoders = {weights.level: PackedDecoder(weights, device) for weights in decoders}
+        self.low = np.zeros(3)
+        self.high = np.zeros(3)
+        self._buffers = 1
+        self._queries: RayBatch | None = None
+
+    def copy(self) -> SceneMap:
+        """The same map in arrays of its own, which is meant to exist beside this one."""
+        other = SceneMap(self.decoder_weights, self.config, self.device, self.seed)
+        for level, grid in self.grids.items():
+            other.grids[level].restore(grid.first, grid.shape, grid.features.numpy(), grid.seen.numpy())
+        other.update_from(self, {})
+        other._buffers = 1 + self._buffers
+        return other
+
+    def update_from(self, other: SceneMap, rows: dict[str, wp.array]) -> None:
+        """Take over what changed in ``other``, a map of the same seed: its bounds, the colour decoder, and ``rows`` of
+        each level (int, indices into the other's grid). New vertices start alike in both maps.
+        """
+        self.low, self.high = other.low, other.high
+        for level, grid in self.grids.items():
+            grid.update_from(other.grids[level], rows.get(level))
+        mine, theirs = self.decoders["color"], other.decoders["color"]
+        wp.copy(mine.weights, theirs.weights)
+        wp.copy(mine.transposed, theirs.transposed)
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner, float64 (3,) each [m]."""
+        return self.low, self.high
+
+    def restore_bounds(self, low: np.ndarray, high: np.ndarray) -> None:
+        """Put back saved bounds [m]; the grids are restored one by one."""
+        self.low, self.high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no frame has been mapped yet."""
+        return not self.grids["middle"].row_count
+
+    @phase("growth")
+    def cover(self, low: np.ndarray, high: np.ndarray) -> bool:
+        """Grow the map to hold the box ``low``..``high`` [m] plus the margin; True if it grew.
+
+        Raises:
+            MapSizeError: the grown map would not fit `GridConfig.max_gigabytes`, or what is free.
+        """
+        spacing, margin = self.config.middle_spacing, self.config.margin
+        if not self.is_empty and (low > self.low).all() and (high < self.high).all():
+            return False
+        low = np.floor((low - margin) / spacing) * spacing
+        high = np.ceil((high + margin) / spacing) * spacing
+        if not self.is_empty:
+            low, high = np.minimum(low, self.low), np.maximum(high, self.high)
+        needed = self.gigabytes(low, high)
+        if needed > self.config.max_gigabytes:
+            raise MapSizeError(
+                f"the map would grow to {np.round(high - low, 1).tolist()} m and {needed:.1f} GB, beyond "
+                f"grid.max_gigabytes = {self.config.max_gigabytes}: raise it, lower grid.max_depth "
+                f"(now {self.config.max_depth} m), or check the depth scale"
+            )
+        more = needed - (0.0 if self.is_empty else self.gigabytes(self.low, self.high))
+        free = free_gigabytes(self.device)
+        if free is not None and more > free:
+            raise MapSizeError(
+                f"the map would grow to {np.round(high - low, 1).tolist()} m, which needs {more:.1f} GB more, and "
+                f"{self.device} has {free:.1f} GB free: lower grid.max_depth (now {self.config.max_depth} m), or check "
+                "the depth scale"
+            )
+        self.low, self.high = low, high
+        for level, grid in self.grids.items():
+            # One more coarse cell around, so that the forecast reaches beyond what was seen.
+            extra = grid.spacing if level == "coarse" else 0.0
+            grid.cover(low - extra, high + extra)
+        _log.info("map covers %s to %s m", np.round(low, 2).tolist(), np.round(high, 2).tolist())
+        return True
+
+    def gigabytes(self, low: np.ndarray, high: np.ndarray) -> float:
+        """Memory of the grids over a box, with both Adam moments and the gradient buffers [GB]."""
+        arrays = 2 + self._buffers + slice_count(self.device)
+        rows = sum(float(np.prod((high - low) / grid.spacing + 2)) for grid in self.grids.values())
+        return rows * 32 * 4 * arrays / 1e9
+
+    def arrays(self) -> FieldArrays:
+        """What the kernels read, as it is now."""
+        return FieldArrays(
+            lattices={level: grid.lattice for level, grid in self.grids.items()},
+            features={level: grid.features for level, grid in self.grids.items()},
+            decoders=self.decoders,
+            low=wp.vec3(*self.low),
+            high=wp.vec3(*self.high),
+            seen=self.grids["color"].seen,
+        )
+
+    def query_occupancy(self, points: np.ndarray, level: str = "fine") -> np.ndarray:
+        """Occupancy logits, float32 (N,), at world points (N, 3) [m]; > 0 is occupied, alpha = sigmoid(10 logit) (Eq.
+        1-4).
+
+        level: "coarse", "middle", or "fine" (middle plus the fine residual).
+        """
+        if level not in ("coarse", "middle", "fine"):
+            raise InputError(f"level = {level!r}: expected coarse, middle or fine")
+        return self._query(points, level)
+
+    def query_color(self, points: np.ndarray) -> np.ndarray:
+        """Colours in [0, 1], float32 (N, 3), at world points (N, 3) [m]."""
+        return self._query(points, "color")
+
+    def _query(self, points: np.ndarray, stage: str) -> np.ndarray:
+        points = np.asarray(points, np.float32)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise InputError(f"points have shape {points.shape}, expected (N, 3)")
+        if self.is_empty:
+            raise InputError("the map is empty: step at least one frame first")
+        if self._queries is None:
+            self._queries = RayBatch(QUERY_CHUNK, 1, self.device)
+        batch, arrays = self._queries, self.arrays()
+        parts = []
+        for start in range(0, len(points), QUERY_CHUNK):
+            chunk = points[start : start + QUERY_CHUNK]
+            batch.set_points(chunk)
+            batch.query(arrays, stage)
+            values = batch.color if stage == "color" else batch.logit
+            parts.append(values.numpy()[: len(chunk)].copy())
+        if not parts:
+            return np.zeros((0, 3) if stage == "color" else 0, np.float32)
+        result = np.concatenate(parts)
+        return np.clip(result, 0.0, 1.0) if stage == "color" else result

@@ -1,0 +1,187 @@
+"""Camera tracking (Sec. 3.3): the pose of one frame against a fixed map, Eq. 11-12."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import warp as wp
+
+from warpslam.camera import Intrinsics
+from warpslam.config import SamplingConfig, TrackingConfig
+from warpslam.field.arrays import FieldArrays, Gradients, Thresholds
+from warpslam.field.ray_batch import RayBatch
+from warpslam.field.seeds import ray_seed
+from warpslam.kernels import adam
+from warpslam.poses import pose_from_vector, vector_from_pose
+from warpslam.runtime.launching import Launcher
+from warpslam.scene.image_pool import ImagePool
+from warpslam.scene.optimizers import PoseOptimizer
+
+MIN_SEEN_SHARE = 0.2
+"""Where less of a frame's depth lies in what the map has seen, the share of inliers goes down as if this much did."""
+
+
+@dataclass(frozen=True)
+class TrackingResult:
+    """Outcome of tracking one frame.
+
+    T_world_camera: Estimated pose (4, 4).
+    loss: Mean loss per inlier on the fixed pixels.
+    depth_error: Mean |D - D^| over the inliers [m].
+    inliers: Inliers over rays with a measured depth that count (`TrackingConfig.seen_only`), in [0, 1]; less if few do.
+    agreeing: Inliers over all rays with a measured depth, in [0, 1].
+    """
+
+    T_world_camera: np.ndarray
+    loss: float
+    depth_error: float
+    inliers: float
+    agreeing: float
+
+
+class Tracker:
+    """Optimises the pose of the frame in slot 0 of the image pool, with new random rays in every iteration."""
+
+    def __init__(
+        self, camera: Intrinsics, config: TrackingConfig, sampling: SamplingConfig, device: wp.Device, seed: int
+    ) -> None:
+        self.camera, self.config, self.sampling, self.device, self.seed = camera, config, sampling, device, seed
+        self._launcher = Launcher(device)
+        self._batch = self._new_batch(config.pixels)
+        self._poses = PoseOptimizer(1, self._launcher)
+        self._window = wp.zeros(1, dtype=int, device=device)
+        self._visited = wp.zeros((1, 7), dtype=float, device=device)
+        self._thresholds = Thresholds(sampling.min_weight, sampling.min_gradient, sampling.min_transmittance)
+
+    def track(
+        self,
+        arrays: FieldArrays,
+        images: ImagePool,
+        frame: int,
+        initial: np.ndarray,
+        *,
+        effort: int = 1,
+        iteration_factor: int = 1,
+    ) -> TrackingResult:
+        """Estimate the pose of frame ``frame``, starting from ``initial`` (4, 4); ``effort`` multiplies pixels and
+        iterations, ``iteration_factor`` iterations alone.
+        """
+        config = self.config
+        batch = self._batch if effort == 1 else self._new_batch(config.pixels * effort)
+        start = vector_from_pose(initial)
+        visited = self._optimize(batch, arrays, images, frame, start, config.iterations * effort * iteration_factor)
+        candidates = [visited[-1]]
+        if config.keep_best == "fixed_pixels":
+            # Different pixels give different losses; only a comparison on the same ones means something.
+            candidates += [start, visited[len(visited) // 2 :].mean(axis=0)]
+        candidates = [vector for vector in candidates if np.isfinite(vector).all()] or [start]
+        results = [self._judge(batch, arrays, images, frame, vector) for vector in candidates]
+        return min(results, key=lambda result: result.loss)
+
+    def _optimize(
+        self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, frame: int, start: np.ndarray, iterations: int
+    ) -> np.ndarray:
+        """New pixels every iteration; nothing comes back from the device before the last. The poses visited, (n, 7)."""
+        config = self.config
+        progress = np.linspace(0.0, 1.0, iterations)[:, None]
+        rates = config.learning_rate * config.final_rate_factor**progress * [config.rotation_rate_factor, 1.0]
+        self._poses.begin(start[None], rates)
+        batch.set_seeds([self._ray_seed(frame, iteration) for iteration in range(iterations)])
+        if self._visited.shape[0] != iterations:
+            self._visited = wp.zeros((iterations, 7), dtype=float, device=self.device)
+        method = self._descend if config.optimizer == "adam" else self._gauss_newton
+
+        def iterate() -> None:
+            method(batch, arrays, images)
+            self._launcher.launch(adam.note_pose, 7, [batch.iteration, self._poses.poses, self._visited])
+            batch.next_iteration()
+
+        uses = (config.optimizer, config.color_weight, self._poses.rates, self._visited, *self._uses(batch, arrays))
+        for _ in range(iterations):
+            self._launcher.iterate("optimize", (*uses, *images.arrays), iterate)
+        return self._visited.numpy().astype(np.float64)
+
+    def _descend(self, batch: RayBatch, arrays: FieldArrays, images: ImagePool) -> None:
+        """The paper's optimiser: a step of Adam on the pose vector."""
+        with self._launcher.tape() as tape:
+            self._render(batch, arrays, images, tape)
+            batch.tracking_loss(self.config.color_weight)
+        self._launcher.call(partial(tape.backward, batch.loss))
+        self._poses.update()
+
+    def _gauss_newton(self, batch: RayBatch, arrays: FieldArrays, images: ImagePool) -> None:
+        """A Gauss-Newton step on the same loss: its absolute values are reweighted as squares, and colour enters as the
+        mean of its channels.
+        """
+        self._render(batch, arrays, images)
+        batch.gauss_newton_step(arrays, self._poses.poses, self.config.color_weight, thresholds=self._thresholds)
+
+    def explained_share(self, known_error: float) -> float:
+        """Share of the last judged pixels whose rendered depth is within ``known_error`` x D (information gain, Sec.
+        3.4).
+        """
+        count = self._batch.count
+        measured = self._batch.measured_depth.numpy()[:count]
+        valid = (measured > 0) & (self._batch.keep.numpy()[:count] != 0)
+        # Rays that leave the map are unexplained, too.
+        usable = measured > 0
+        error = np.abs(measured - self._batch.depth.numpy()[:count])
+        explained = valid & (error < known_error * np.maximum(measured, 1e-6))
+        return float(explained.sum() / max(usable.sum(), 1))
+
+    def _judge(
+        self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, frame: int, vector: np.ndarray
+    ) -> TrackingResult:
+        self._poses.begin(vector[None])
+        batch.set_seeds([self._ray_seed(frame, -1)])
+
+        def judge() -> None:
+            self._render(batch, arrays, images)
+            batch.tracking_loss(self.config.color_weight)
+
+        uses = (self.config.color_weight, *self._uses(batch, arrays), *images.arrays)
+        self._launcher.iterate("judge", uses, judge)
+        count = batch.count
+        inlier = batch.inlier.numpy()[:count] != 0
+        measured = batch.measured_depth.numpy()[:count]
+        has_depth = measured > 0
+        depth_count = max(int(has_depth.sum()), 1)
+        counting = max(int((has_depth & (batch.keep.numpy()[:count] != 0)).sum()), MIN_SEEN_SHARE * depth_count)
+        inlier_count = int(inlier.sum())
+        error = np.abs(measured - batch.depth.numpy()[:count])[inlier]
+        loss = float(batch.loss.numpy()[0]) / inlier_count if inlier_count else np.inf
+        return TrackingResult(
+            T_world_camera=pose_from_vector(vector),
+            loss=loss if np.isfinite(loss) else np.inf,
+            depth_error=float(error.mean()) if inlier_count else np.inf,
+            inliers=inlier_count / counting,
+            agreeing=inlier_count / depth_count,
+        )
+
+    def _render(self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, tape: wp.Tape | None = None) -> None:
+        config, sampling = self.config, self.sampling
+        edges = (config.ignore_edge_u, config.ignore_edge_v)
+        batch.draw(images.arrays, self._window, batch.capacity, self.camera, edges=edges)
+        batch.cast(self._poses.poses, differentiate=tape is not None)
+        batch.bound(arrays)
+        if config.seen_only:
+            batch.drop_unseen(arrays)
+        batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)
+        gradients = None if tape is None else Gradients(points=True)
+        batch.render(arrays, "color", gradients, tape, thresholds=self._thresholds)
+        batch.choose_inliers(config.dynamic_filter, median_includes_missing=config.median_includes_missing)
+
+    def _uses(self, batch: RayBatch, arrays: FieldArrays) -> tuple:
+        """What a recorded iteration stands on."""
+        features = (arrays.features[level] for level in ("middle", "fine", "color"))
+        weights = (arrays.decoders[level].weights for level in ("middle", "fine", "color"))
+        return (batch, batch.seeds, self._poses.poses, arrays.seen, *features, *weights, *arrays.low, *arrays.high)
+
+    def _ray_seed(self, frame: int, iteration: int) -> int:
+        return ray_seed(self.seed, 1, frame, iteration)
+
+    def _new_batch(self, pixels: int) -> RayBatch:
+        samples = self.sampling.stratified + self.sampling.surface
+        return RayBatch(pixels, samples, self.device, self._launcher)
