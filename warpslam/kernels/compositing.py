@@ -46,12 +46,12 @@ def occupancy(logit: float) -> float:
 def start_rays(
     start: int,
     slot: int,
-    listed_count: wp.array(dtype=int),
-    keep: wp.array(dtype=int),
-    transmittance: wp.array(dtype=float),
-    depth: wp.array(dtype=float),
-    variance: wp.array(dtype=float),
-    rgb: wp.array(dtype=wp.vec3),
+    listed_count: wp.array[int],
+    keep: wp.array[int],
+    transmittance: wp.array[float],
+    depth: wp.array[float],
+    variance: wp.array[float],
+    rgb: wp.array[wp.vec3],
 ):
     """Nothing absorbed yet, nothing listed; a transmittance of -1 marks rays that are not kept."""
     tid = start + wp.tid()
@@ -72,13 +72,13 @@ def composite(
     min_transmittance: float,
     low: wp.vec3,
     high: wp.vec3,
-    ray_origin: wp.array(dtype=wp.vec3),
-    ray_direction: wp.array(dtype=wp.vec3),
-    z: wp.array(dtype=float),
-    logit: wp.array(dtype=float),
-    weight: wp.array(dtype=float),
-    transmittance: wp.array(dtype=float),
-    depth: wp.array(dtype=float),
+    ray_origin: wp.array[wp.vec3],
+    ray_direction: wp.array[wp.vec3],
+    z: wp.array[float],
+    logit: wp.array[float],
+    weight: wp.array[float],
+    transmittance: wp.array[float],
+    depth: wp.array[float],
 ):
     """Weights of the next samples of each ray, whose transmittance and depth so far are carried along."""
     tid = start + wp.tid()
@@ -109,11 +109,11 @@ def composite(
 def ray_variance(
     start: int,
     sample_count: int,
-    z: wp.array(dtype=float),
-    keep: wp.array(dtype=int),
-    weight: wp.array(dtype=float),
-    depth: wp.array(dtype=float),
-    variance: wp.array(dtype=float),
+    z: wp.array[float],
+    keep: wp.array[int],
+    weight: wp.array[float],
+    depth: wp.array[float],
+    variance: wp.array[float],
 ):
     tid = start + wp.tid()
     if keep[tid] == 0:
@@ -130,12 +130,12 @@ def list_weighty(
     start: int,
     slot: int,
     sample_count: int,
-    keep: wp.array(dtype=int),
-    weight: wp.array(dtype=float),
+    keep: wp.array[int],
+    weight: wp.array[float],
     min_weight: float,
-    color: wp.array(dtype=wp.vec3),
-    listed: wp.array(dtype=int),
-    listed_count: wp.array(dtype=int),
+    color: wp.array[wp.vec3],
+    listed: wp.array[int],
+    listed_count: wp.array[int],
 ):
     """List the samples that weigh at least ``min_weight``, and make the others black."""
     tid = start + wp.tid()
@@ -160,10 +160,10 @@ def list_steep(
     start: int,
     slot: int,
     sample_count: int,
-    logit_grad: wp.array(dtype=float),
+    logit_grad: wp.array[float],
     min_gradient: float,
-    listed: wp.array(dtype=int),
-    listed_count: wp.array(dtype=int),
+    listed: wp.array[int],
+    listed_count: wp.array[int],
 ):
     """List the samples with a gradient beyond ``min_gradient``."""
     tid = start + wp.tid()
@@ -183,10 +183,10 @@ def list_steep(
 def composite_color(
     start: int,
     sample_count: int,
-    keep: wp.array(dtype=int),
-    color: wp.array(dtype=wp.vec3),
-    weight: wp.array(dtype=float),
-    rgb: wp.array(dtype=wp.vec3),
+    keep: wp.array[int],
+    color: wp.array[wp.vec3],
+    weight: wp.array[float],
+    rgb: wp.array[wp.vec3],
 ):
     tid = start + wp.tid()
     if keep[tid] == 0:
@@ -201,12 +201,12 @@ def composite_color(
 @wp.kernel(enable_backward=False)
 def surface_depth(
     sample_count: int,
-    keep: wp.array(dtype=int),
-    z: wp.array(dtype=float),
-    logit: wp.array(dtype=float),
-    weight: wp.array(dtype=float),
+    keep: wp.array[int],
+    z: wp.array[float],
+    logit: wp.array[float],
+    weight: wp.array[float],
     min_occupancy: float,
-    depth: wp.array(dtype=float),
+    depth: wp.array[float],
 ):
     """Depth of the first sample that is occupied, or, where none is, of that at which half of the ray's weight is
     spent.
@@ -234,19 +234,19 @@ def surface_depth(
 def composite_backward(
     start: int,
     slot: int,
-    listed_count: wp.array(dtype=int),
+    listed_count: wp.array[int],
     sample_count: int,
-    z: wp.array(dtype=float),
-    keep: wp.array(dtype=int),
-    logit: wp.array(dtype=float),
+    z: wp.array[float],
+    keep: wp.array[int],
+    logit: wp.array[float],
     with_color: int,
-    color: wp.array(dtype=wp.vec3),
-    weight: wp.array(dtype=float),
+    color: wp.array[wp.vec3],
+    weight: wp.array[float],
     min_weight: float,
-    depth_grad: wp.array(dtype=float),
-    rgb_grad: wp.array(dtype=wp.vec3),
-    logit_grad: wp.array(dtype=float),
-    color_grad: wp.array(dtype=wp.vec3),
+    depth_grad: wp.array[float],
+    rgb_grad: wp.array[wp.vec3],
+    logit_grad: wp.array[float],
+    color_grad: wp.array[wp.vec3],
 ):
     """Also empties the list that `list_steep` fills next."""
     tid = start + wp.tid()

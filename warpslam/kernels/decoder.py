@@ -99,7 +99,7 @@ def sine_cosine(x: float) -> wp.vec2:
 
 
 @wp.func
-def angles(p: wp.vec3, weights: wp.array(dtype=Vec32), chunk: int) -> Vec32:
+def angles(p: wp.vec3, weights: wp.array[Vec32], chunk: int) -> Vec32:
     return p[0] * weights[B + 3 * chunk] + p[1] * weights[B + 3 * chunk + 1] + p[2] * weights[B + 3 * chunk + 2]
 
 
@@ -113,9 +113,9 @@ def sample_index(point: int, first_ray: int, first_sample: int, width: int, samp
 def sample_point(
     sample: int,
     sample_count: int,
-    ray_origin: wp.array(dtype=wp.vec3),
-    ray_direction: wp.array(dtype=wp.vec3),
-    z: wp.array(dtype=float),
+    ray_origin: wp.array[wp.vec3],
+    ray_direction: wp.array[wp.vec3],
+    z: wp.array[float],
 ) -> wp.vec3:
     ray = sample // sample_count
     return ray_origin[ray] + z[sample] * ray_direction[ray]
@@ -172,7 +172,7 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         return r
 
     @func
-    def matvec(r: Block, x: Block, W: wp.array(dtype=Vec32), row: int, trips: int) -> Block:
+    def matvec(r: Block, x: Block, W: wp.array[Vec32], row: int, trips: int) -> Block:
         """r + sum_k x[:, k] W[row + k]."""
         s = Block(r)
         if wp.static(on_cpu):
@@ -196,7 +196,7 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         return r
 
     @func
-    def store_bits(bits: wp.array2d(dtype=wp.uint32), samples: Indices, layer: int, a: Block):
+    def store_bits(bits: wp.array2d[wp.uint32], samples: Indices, layer: int, a: Block):
         """Which units of a layer are active."""
         for p in range(size):
             word = wp.uint32(0)
@@ -206,7 +206,7 @@ def decoder_kernels(target: str) -> SimpleNamespace:
             bits[samples[p], layer] = word
 
     @func
-    def keep_active(a: Block, bits: wp.array2d(dtype=wp.uint32), samples: Indices, layer: int) -> Block:
+    def keep_active(a: Block, bits: wp.array2d[wp.uint32], samples: Indices, layer: int) -> Block:
         """Adjoint of the ReLU of a layer."""
         r = Block()
         for p in range(size):
@@ -216,7 +216,7 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         return r
 
     @func
-    def embed(positions: Positions, W: wp.array(dtype=Vec32), chunk: int) -> Block:
+    def embed(positions: Positions, W: wp.array[Vec32], chunk: int) -> Block:
         """32 of the 96 sines of the embedding."""
         e = Block()
         for p in range(size):
@@ -228,8 +228,8 @@ def decoder_kernels(target: str) -> SimpleNamespace:
     @func
     def angle_adjoint(
         positions: Positions,
-        W: wp.array(dtype=Vec32),
-        T: wp.array(dtype=Vec32),
+        W: wp.array[Vec32],
+        T: wp.array[Vec32],
         chunk: int,
         a0: Block,
         a3: Block,
@@ -269,12 +269,12 @@ def decoder_kernels(target: str) -> SimpleNamespace:
 
     @func
     def add_outer(
-        grad: wp.array2d(dtype=Vec32),
+        grad: wp.array2d[Vec32],
         slot: int,
         row: int,
-        inputs: wp.array3d(dtype=float),
+        inputs: wp.array3d[float],
         x: int,
-        layer_grad: wp.array2d(dtype=Vec32),
+        layer_grad: wp.array2d[Vec32],
         d: int,
     ):
         """grad[row + k] += sum over a slice's group of x[k] d, both columns of what its samples stored."""
@@ -297,7 +297,7 @@ def decoder_kernels(target: str) -> SimpleNamespace:
             grad[slot, row + 4 * k + 3] = grad[slot, row + 4 * k + 3] + r3
 
     @func
-    def add_sum(grad: wp.array2d(dtype=Vec32), slot: int, row: int, d: Block):
+    def add_sum(grad: wp.array2d[Vec32], slot: int, row: int, d: Block):
         """grad[row] += sum over the block of d."""
         total = Vec32()
         for p in range(size):
@@ -326,7 +326,7 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         return wanted
 
     @func
-    def listed_samples(thread: int, count: int, start: int, listed: wp.array(dtype=int)) -> Indices:
+    def listed_samples(thread: int, count: int, start: int, listed: wp.array[int]) -> Indices:
         """Samples of a thread on a list; the last one stands in for those behind its end."""
         samples = Indices()
         for p in range(size):
@@ -334,16 +334,14 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         return samples
 
     @func
-    def wanted_gradient(samples: Indices, wanted: Indices, logit_grad: wp.array(dtype=float)) -> Scalars:
+    def wanted_gradient(samples: Indices, wanted: Indices, logit_grad: wp.array[float]) -> Scalars:
         d = Scalars()
         for p in range(size):
             d[p] = wp.where(wanted[p] != 0, logit_grad[samples[p]], 0.0)
         return d
 
     @func
-    def any_lit(
-        samples: Indices, sample_count: int, transmittance: wp.array(dtype=float), min_transmittance: float
-    ) -> bool:
+    def any_lit(samples: Indices, sample_count: int, transmittance: wp.array[float], min_transmittance: float) -> bool:
         lit = bool(False)
         for p in range(size):
             if transmittance[samples[p] // sample_count] >= min_transmittance:
@@ -354,9 +352,9 @@ def decoder_kernels(target: str) -> SimpleNamespace:
     def positions_of(
         samples: Indices,
         sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
+        ray_origin: wp.array[wp.vec3],
+        ray_direction: wp.array[wp.vec3],
+        z: wp.array[float],
     ) -> Positions:
         positions = Positions()
         for p in range(size):
@@ -364,7 +362,7 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         return positions
 
     @func
-    def look_up(positions: Positions, lattice: Lattice, features: wp.array(dtype=Vec32)) -> Block:
+    def look_up(positions: Positions, lattice: Lattice, features: wp.array[Vec32]) -> Block:
         c = Block()
         for p in range(size):
             x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
@@ -373,9 +371,9 @@ def decoder_kernels(target: str) -> SimpleNamespace:
 
     @func
     def add_to_grid(
-        grid_grad: wp.array2d(dtype=Vec32),
+        grid_grad: wp.array2d[Vec32],
         slot: int,
-        selected: wp.array(dtype=wp.uint8),
+        selected: wp.array[wp.uint8],
         lattice: Lattice,
         positions: Positions,
         wanted: Indices,
@@ -388,14 +386,14 @@ def decoder_kernels(target: str) -> SimpleNamespace:
 
     @func
     def add_to_points(
-        point_grad: wp.array(dtype=wp.vec3),
+        point_grad: wp.array[wp.vec3],
         samples: Indices,
         positions: Positions,
         wanted: Indices,
         lattice: Lattice,
-        features: wp.array(dtype=Vec32),
-        W: wp.array(dtype=Vec32),
-        T: wp.array(dtype=Vec32),
+        features: wp.array[Vec32],
+        W: wp.array[Vec32],
+        T: wp.array[Vec32],
         dc: Block,
         a0: Block,
         a3: Block,
@@ -436,16 +434,16 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         width: int,
         trips: int,
         sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
-        transmittance: wp.array(dtype=float),
+        ray_origin: wp.array[wp.vec3],
+        ray_direction: wp.array[wp.vec3],
+        z: wp.array[float],
+        transmittance: wp.array[float],
         min_transmittance: float,
         lattice: Lattice,
-        features: wp.array(dtype=Vec32),
-        W: wp.array(dtype=Vec32),
-        bits: wp.array2d(dtype=wp.uint32),
-        logit: wp.array(dtype=float),
+        features: wp.array[Vec32],
+        W: wp.array[Vec32],
+        bits: wp.array2d[wp.uint32],
+        logit: wp.array[float],
     ):
         samples = block_samples(wp.tid(), point_count, first_ray, first_sample, width, sample_count)
         if not any_lit(samples, sample_count, transmittance, min_transmittance):
@@ -477,7 +475,7 @@ def decoder_kernels(target: str) -> SimpleNamespace:
             logit[samples[p]] = out[p] + W[OUT_32 + 1][0]
 
     @func
-    def add_conditions(h: Block, c: Block, m: Block, W: wp.array(dtype=Vec32), layer: int, trips: int) -> Block:
+    def add_conditions(h: Block, c: Block, m: Block, W: wp.array[Vec32], layer: int, trips: int) -> Block:
         """h + V_k [c, m] + d_k of the fine decoder."""
         r = matvec(h + fill(W[FC_BIAS + layer]), c, W, V + 64 * layer, trips)
         return matvec(r, m, W, V + 64 * layer + 32, trips)
@@ -490,18 +488,18 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         width: int,
         trips: int,
         sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
-        transmittance: wp.array(dtype=float),
+        ray_origin: wp.array[wp.vec3],
+        ray_direction: wp.array[wp.vec3],
+        z: wp.array[float],
+        transmittance: wp.array[float],
         min_transmittance: float,
         lattice: Lattice,
-        features: wp.array(dtype=Vec32),
+        features: wp.array[Vec32],
         middle_lattice: Lattice,
-        middle_features: wp.array(dtype=Vec32),
-        W: wp.array(dtype=Vec32),
-        bits: wp.array2d(dtype=wp.uint32),
-        logit: wp.array(dtype=float),
+        middle_features: wp.array[Vec32],
+        W: wp.array[Vec32],
+        bits: wp.array2d[wp.uint32],
+        logit: wp.array[float],
     ):
         samples = block_samples(wp.tid(), point_count, first_ray, first_sample, width, sample_count)
         if not any_lit(samples, sample_count, transmittance, min_transmittance):
@@ -542,25 +540,25 @@ def decoder_kernels(target: str) -> SimpleNamespace:
     def geometry_backward(
         start: int,
         slot: int,
-        listed: wp.array(dtype=int),
-        listed_count: wp.array(dtype=int),
+        listed: wp.array[int],
+        listed_count: wp.array[int],
         trips: int,
         sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
+        ray_origin: wp.array[wp.vec3],
+        ray_direction: wp.array[wp.vec3],
+        z: wp.array[float],
         lattice: Lattice,
-        features: wp.array(dtype=Vec32),
-        W: wp.array(dtype=Vec32),
-        T: wp.array(dtype=Vec32),
+        features: wp.array[Vec32],
+        W: wp.array[Vec32],
+        T: wp.array[Vec32],
         output_row: int,
-        bits: wp.array2d(dtype=wp.uint32),
-        logit_grad: wp.array(dtype=float),
+        bits: wp.array2d[wp.uint32],
+        logit_grad: wp.array[float],
         want_grid: int,
-        selected: wp.array(dtype=wp.uint8),
-        grid_grad: wp.array2d(dtype=Vec32),
+        selected: wp.array[wp.uint8],
+        grid_grad: wp.array2d[Vec32],
         want_point: int,
-        point_grad: wp.array(dtype=wp.vec3),
+        point_grad: wp.array[wp.vec3],
     ):
         """Adjoint of `middle_forward` and of `fine_forward` (they differ in ``output_row``)."""
         thread = wp.tid()
@@ -594,13 +592,13 @@ def decoder_kernels(target: str) -> SimpleNamespace:
     # -- colour ----------------------------------------------------------------------------------------------------
 
     @func
-    def store_rows(rows: wp.array2d(dtype=Vec32), samples: Indices, column: int, a: Block, wanted: int):
+    def store_rows(rows: wp.array2d[Vec32], samples: Indices, column: int, a: Block, wanted: int):
         if wanted != 0:
             for p in range(size):
                 rows[samples[p], column] = a[p]
 
     @func
-    def load_rows(rows: wp.array2d(dtype=Vec32), samples: Indices, column: int) -> Block:
+    def load_rows(rows: wp.array2d[Vec32], samples: Indices, column: int) -> Block:
         a = Block()
         for p in range(size):
             a[p] += rows[samples[p], column]
@@ -610,20 +608,20 @@ def decoder_kernels(target: str) -> SimpleNamespace:
     def color_forward(
         start: int,
         slot: int,
-        listed: wp.array(dtype=int),
-        listed_count: wp.array(dtype=int),
+        listed: wp.array[int],
+        listed_count: wp.array[int],
         trips: int,
         sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
+        ray_origin: wp.array[wp.vec3],
+        ray_direction: wp.array[wp.vec3],
+        z: wp.array[float],
         lattice: Lattice,
-        features: wp.array(dtype=Vec32),
-        W: wp.array(dtype=Vec32),
-        bits: wp.array2d(dtype=wp.uint32),
+        features: wp.array[Vec32],
+        W: wp.array[Vec32],
+        bits: wp.array2d[wp.uint32],
         want_activations: int,
-        activations: wp.array2d(dtype=Vec32),
-        color: wp.array(dtype=wp.vec3),
+        activations: wp.array2d[Vec32],
+        color: wp.array[wp.vec3],
     ):
         thread = wp.tid()
         count = listed_count[count_index(slot)]
@@ -671,27 +669,27 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         count: int,
         start: int,
         slot: int,
-        listed: wp.array(dtype=int),
+        listed: wp.array[int],
         trips: int,
         sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
+        ray_origin: wp.array[wp.vec3],
+        ray_direction: wp.array[wp.vec3],
+        z: wp.array[float],
         lattice: Lattice,
-        features: wp.array(dtype=Vec32),
-        W: wp.array(dtype=Vec32),
-        T: wp.array(dtype=Vec32),
-        bits: wp.array2d(dtype=wp.uint32),
-        color_grad: wp.array(dtype=wp.vec3),
+        features: wp.array[Vec32],
+        W: wp.array[Vec32],
+        T: wp.array[Vec32],
+        bits: wp.array2d[wp.uint32],
+        color_grad: wp.array[wp.vec3],
         want_grid: int,
-        selected: wp.array(dtype=wp.uint8),
-        grid_grad: wp.array2d(dtype=Vec32),
+        selected: wp.array[wp.uint8],
+        grid_grad: wp.array2d[Vec32],
         want_point: int,
-        point_grad: wp.array(dtype=wp.vec3),
+        point_grad: wp.array[wp.vec3],
         want_weights: int,
-        activations: wp.array2d(dtype=Vec32),
-        weight_grad: wp.array2d(dtype=Vec32),
-        layer_grad: wp.array2d(dtype=Vec32),
+        activations: wp.array2d[Vec32],
+        weight_grad: wp.array2d[Vec32],
+        layer_grad: wp.array2d[Vec32],
         group_row: int,
     ):
         """Adjoint of a block of `color_forward`; see `color_backward`. Within the kernel's loop, and not in a function,
@@ -797,30 +795,30 @@ def decoder_kernels(target: str) -> SimpleNamespace:
     def color_backward(
         start: int,
         slot: int,
-        listed: wp.array(dtype=int),
-        listed_count: wp.array(dtype=int),
+        listed: wp.array[int],
+        listed_count: wp.array[int],
         blocks: int,
         trips: int,
         sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
+        ray_origin: wp.array[wp.vec3],
+        ray_direction: wp.array[wp.vec3],
+        z: wp.array[float],
         lattice: Lattice,
-        features: wp.array(dtype=Vec32),
-        W: wp.array(dtype=Vec32),
-        T: wp.array(dtype=Vec32),
-        bits: wp.array2d(dtype=wp.uint32),
-        color_grad: wp.array(dtype=wp.vec3),
+        features: wp.array[Vec32],
+        W: wp.array[Vec32],
+        T: wp.array[Vec32],
+        bits: wp.array2d[wp.uint32],
+        color_grad: wp.array[wp.vec3],
         want_grid: int,
-        selected: wp.array(dtype=wp.uint8),
-        grid_grad: wp.array2d(dtype=Vec32),
+        selected: wp.array[wp.uint8],
+        grid_grad: wp.array2d[Vec32],
         want_point: int,
-        point_grad: wp.array(dtype=wp.vec3),
+        point_grad: wp.array[wp.vec3],
         want_weights: int,
-        activations: wp.array2d(dtype=Vec32),
-        weight_grad: wp.array2d(dtype=Vec32),
-        layer_grad: wp.array2d(dtype=Vec32),
-        layer_inputs: wp.array3d(dtype=float),
+        activations: wp.array2d[Vec32],
+        weight_grad: wp.array2d[Vec32],
+        layer_grad: wp.array2d[Vec32],
+        layer_inputs: wp.array3d[float],
     ):
         """Adjoint of `color_forward`; a thread works on ``blocks`` blocks, on the CPU on `WEIGHT_GROUP` samples.
 
@@ -860,16 +858,16 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         width: int,
         trips: int,
         sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
-        transmittance: wp.array(dtype=float),
+        ray_origin: wp.array[wp.vec3],
+        ray_direction: wp.array[wp.vec3],
+        z: wp.array[float],
+        transmittance: wp.array[float],
         min_transmittance: float,
         lattice: Lattice,
-        features: wp.array(dtype=Vec32),
-        W: wp.array(dtype=Vec32),
-        bits: wp.array2d(dtype=wp.uint32),
-        logit: wp.array(dtype=float),
+        features: wp.array[Vec32],
+        W: wp.array[Vec32],
+        bits: wp.array2d[wp.uint32],
+        logit: wp.array[float],
     ):
         samples = block_samples(wp.tid(), point_count, first_ray, first_sample, width, sample_count)
         if not any_lit(samples, sample_count, transmittance, min_transmittance):
@@ -894,20 +892,20 @@ def decoder_kernels(target: str) -> SimpleNamespace:
     def coarse_backward(
         start: int,
         slot: int,
-        listed: wp.array(dtype=int),
-        listed_count: wp.array(dtype=int),
+        listed: wp.array[int],
+        listed_count: wp.array[int],
         trips: int,
         sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
+        ray_origin: wp.array[wp.vec3],
+        ray_direction: wp.array[wp.vec3],
+        z: wp.array[float],
         lattice: Lattice,
-        W: wp.array(dtype=Vec32),
-        T: wp.array(dtype=Vec32),
-        bits: wp.array2d(dtype=wp.uint32),
-        logit_grad: wp.array(dtype=float),
-        selected: wp.array(dtype=wp.uint8),
-        grid_grad: wp.array2d(dtype=Vec32),
+        W: wp.array[Vec32],
+        T: wp.array[Vec32],
+        bits: wp.array2d[wp.uint32],
+        logit_grad: wp.array[float],
+        selected: wp.array[wp.uint8],
+        grid_grad: wp.array2d[Vec32],
     ):
         """Adjoint of `coarse_forward`; the coarse level serves mapping only: the position gets no gradient."""
         thread = wp.tid()
@@ -932,14 +930,14 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         point_count: int,
         chunk_size: int,
         sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
-        W: wp.array(dtype=Vec32),
-        activations: wp.array2d(dtype=Vec32),
-        color_grad: wp.array(dtype=wp.vec3),
-        layer_grad: wp.array2d(dtype=Vec32),
-        weight_grad: wp.array2d(dtype=Vec32),
+        ray_origin: wp.array[wp.vec3],
+        ray_direction: wp.array[wp.vec3],
+        z: wp.array[float],
+        W: wp.array[Vec32],
+        activations: wp.array2d[Vec32],
+        color_grad: wp.array[wp.vec3],
+        layer_grad: wp.array2d[Vec32],
+        weight_grad: wp.array2d[Vec32],
     ):
         """Sum the weight gradient over a chunk of points: x^T d for each layer, one thread a row of the weights (CUDA).
 
@@ -985,7 +983,7 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         wp.atomic_add(weight_grad, 0, row, total)
 
     @kernel
-    def transpose_color_weights(W: wp.array(dtype=Vec32), T: wp.array(dtype=Vec32)):
+    def transpose_color_weights(W: wp.array[Vec32], T: wp.array[Vec32]):
         """Bring the transposed rows in line with the weights: one thread a row of ``T`` (480)."""
         row = wp.tid()
         block = row // 32

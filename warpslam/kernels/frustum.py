@@ -15,7 +15,7 @@ from warpslam.kernels.rays import nearest_pixel
 
 
 @wp.func
-def bilinear_depth(image: wp.array2d(dtype=float), u: float, v: float) -> float:
+def bilinear_depth(image: wp.array2d[float], u: float, v: float) -> float:
     """Bilinear lookup, 0 outside the image."""
     height = image.shape[0]
     width = image.shape[1]
@@ -39,10 +39,10 @@ def project_vertices(
     T_camera_world: wp.mat44,
     focal: wp.vec2,
     center: wp.vec2,
-    image: wp.array2d(dtype=float),
-    looked_up: wp.array(dtype=float),
-    vertex_depth: wp.array(dtype=float),
-    max_depth: wp.array(dtype=float),
+    image: wp.array2d[float],
+    looked_up: wp.array[float],
+    vertex_depth: wp.array[float],
+    max_depth: wp.array[float],
 ):
     """First pass: depth of the vertex (-1 where it projects outside the image) and measured depth at its pixel."""
     i, j, k = wp.tid()
@@ -65,10 +65,10 @@ def select_vertices(
     lattice: Lattice,
     camera_center: wp.vec3,
     margin: float,
-    looked_up: wp.array(dtype=float),
-    vertex_depth: wp.array(dtype=float),
-    max_depth: wp.array(dtype=float),
-    selected: wp.array(dtype=wp.uint8),
+    looked_up: wp.array[float],
+    vertex_depth: wp.array[float],
+    max_depth: wp.array[float],
+    selected: wp.array[wp.uint8],
 ):
     i, j, k = wp.tid()
     row = row_of(lattice, i, j, k)
@@ -83,7 +83,7 @@ def select_vertices(
 
 @wp.func
 def behind_surface(
-    p: wp.vec3, T_camera_world: wp.mat44, focal: wp.vec2, center: wp.vec2, image: wp.array2d(dtype=float)
+    p: wp.vec3, T_camera_world: wp.mat44, focal: wp.vec2, center: wp.vec2, image: wp.array2d[float]
 ) -> float:
     """How far a point lies behind the surface that its nearest pixel measures [m]; infinite where none does.
 
@@ -109,9 +109,9 @@ def mark_seen(
     T_camera_world: wp.mat44,
     focal: wp.vec2,
     center: wp.vec2,
-    image: wp.array2d(dtype=float),
+    image: wp.array2d[float],
     reach: float,
-    seen: wp.array(dtype=wp.uint8),
+    seen: wp.array[wp.uint8],
 ):
     """Vertices in view that lie in front of the measured surface or less than ``reach`` behind it."""
     i, j, k = wp.tid()
@@ -125,14 +125,14 @@ def start_from_depth(
     T_camera_world: wp.mat44,
     focal: wp.vec2,
     center: wp.vec2,
-    image: wp.array2d(dtype=float),
-    selected: wp.array(dtype=wp.uint8),
+    image: wp.array2d[float],
+    selected: wp.array[wp.uint8],
     base: Vec32,
     slope: Vec32,
     truncation: float,
     reach: float,
-    seen: wp.array(dtype=wp.uint8),
-    features: wp.array(dtype=Vec32),
+    seen: wp.array[wp.uint8],
+    features: wp.array[Vec32],
 ):
     """Vertices seen for the first time. Once started, a vertex is the optimiser's."""
     i, j, k = wp.tid()

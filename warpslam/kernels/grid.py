@@ -80,7 +80,7 @@ def corner_weight(offset: wp.vec3, di: int, dj: int, dk: int) -> float:
 
 
 @wp.func
-def interpolate(features: wp.array(dtype=Vec32), lattice: Lattice, cell: Cell) -> Vec32:
+def interpolate(features: wp.array[Vec32], lattice: Lattice, cell: Cell) -> Vec32:
     """Trilinear features at a point."""
     i = cell.corner[0]
     j = cell.corner[1]
@@ -112,7 +112,7 @@ def dot32(a: Vec32, b: Vec32) -> float:
 
 
 @wp.func
-def interpolate_adjoint_point(features: wp.array(dtype=Vec32), lattice: Lattice, cell: Cell, dc: Vec32) -> wp.vec3:
+def interpolate_adjoint_point(features: wp.array[Vec32], lattice: Lattice, cell: Cell, dc: Vec32) -> wp.vec3:
     """Gradient with respect to the point."""
     i = cell.corner[0]
     j = cell.corner[1]
@@ -138,9 +138,9 @@ def interpolate_adjoint_point(features: wp.array(dtype=Vec32), lattice: Lattice,
 
 @wp.func
 def interpolate_adjoint_features(
-    grad: wp.array2d(dtype=Vec32),
+    grad: wp.array2d[Vec32],
     slot: int,
-    selected: wp.array(dtype=wp.uint8),
+    selected: wp.array[wp.uint8],
     lattice: Lattice,
     cell: Cell,
     dc: Vec32,
@@ -175,11 +175,11 @@ def fill_grid(
     level: int,
     std: float,
     old_lattice: Lattice,
-    old_features: wp.array(dtype=Vec32),
-    old_seen: wp.array(dtype=wp.uint8),
+    old_features: wp.array[Vec32],
+    old_seen: wp.array[wp.uint8],
     shift: wp.vec3i,
-    features: wp.array(dtype=Vec32),
-    seen: wp.array(dtype=wp.uint8),
+    features: wp.array[Vec32],
+    seen: wp.array[wp.uint8],
 ):
     """Fill a grid of any extent: rows of the old grid are kept, the others start random (``first``: world index of
     vertex 0).
@@ -200,7 +200,7 @@ def fill_grid(
 
 
 @wp.kernel(enable_backward=False)
-def copy_rows(rows: wp.array(dtype=int), source: wp.array(dtype=Vec32), target: wp.array(dtype=Vec32)):
+def copy_rows(rows: wp.array[int], source: wp.array[Vec32], target: wp.array[Vec32]):
     """Copy the rows that are listed from one grid to another of the same shape."""
     row = rows[wp.tid()]
     target[row] = source[row]

@@ -34,10 +34,10 @@ def density_at(
     ray: int,
     low: wp.vec3,
     high: wp.vec3,
-    ray_origin: wp.array(dtype=wp.vec3),
-    ray_direction: wp.array(dtype=wp.vec3),
-    z: wp.array(dtype=float),
-    density: wp.array(dtype=float),
+    ray_origin: wp.array[wp.vec3],
+    ray_direction: wp.array[wp.vec3],
+    z: wp.array[float],
+    density: wp.array[float],
 ) -> float:
     """Density of a sample, that of outside where it is."""
     if not is_inside(ray_origin[ray] + z[i] * ray_direction[ray], low, high):
@@ -48,16 +48,16 @@ def density_at(
 @wp.kernel(enable_backward=False)
 def place_stratified(
     start: int,
-    seeds: wp.array(dtype=int),
-    iteration: wp.array(dtype=int),
+    seeds: wp.array[int],
+    iteration: wp.array[int],
     jitter: int,
     count: int,
     sample_count: int,
     use_depth: int,
-    depth: wp.array(dtype=float),
-    t_exit: wp.array(dtype=float),
-    max_depth: wp.array(dtype=float),
-    z: wp.array(dtype=float),
+    depth: wp.array[float],
+    t_exit: wp.array[float],
+    max_depth: wp.array[float],
+    z: wp.array[float],
 ):
     """The strata of `warpslam.kernels.rays`, without samples near the surface."""
     ray = start + wp.tid()
@@ -77,15 +77,15 @@ def place_importance(
     stratified: int,
     importance: int,
     sample_count: int,
-    keep: wp.array(dtype=int),
+    keep: wp.array[int],
     low: wp.vec3,
     high: wp.vec3,
-    ray_origin: wp.array(dtype=wp.vec3),
-    ray_direction: wp.array(dtype=wp.vec3),
-    density: wp.array(dtype=float),
-    weight: wp.array(dtype=float),
-    z: wp.array(dtype=float),
-    order: wp.array(dtype=int),
+    ray_origin: wp.array[wp.vec3],
+    ray_direction: wp.array[wp.vec3],
+    density: wp.array[float],
+    weight: wp.array[float],
+    z: wp.array[float],
+    order: wp.array[int],
 ):
     """Inverse CDF of the inner stratified weights over the midpoints between samples, at even steps; and the order
     of all samples along the ray.
@@ -140,13 +140,13 @@ def place_importance(
 @wp.kernel(enable_backward=False)
 def place_empty(
     start: int,
-    seeds: wp.array(dtype=int),
-    iteration: wp.array(dtype=int),
+    seeds: wp.array[int],
+    iteration: wp.array[int],
     first_sample: int,
     count: int,
     sample_count: int,
-    depth: wp.array(dtype=float),
-    z: wp.array(dtype=float),
+    depth: wp.array[float],
+    z: wp.array[float],
 ):
     """Jittered samples in [0, 0.85 D], where nothing should be."""
     ray = start + wp.tid()
@@ -161,20 +161,20 @@ def composite(
     start: int,
     visible: int,
     sample_count: int,
-    keep: wp.array(dtype=int),
+    keep: wp.array[int],
     low: wp.vec3,
     high: wp.vec3,
-    ray_origin: wp.array(dtype=wp.vec3),
-    ray_direction: wp.array(dtype=wp.vec3),
-    z: wp.array(dtype=float),
-    order: wp.array(dtype=int),
-    density: wp.array(dtype=float),
-    color: wp.array(dtype=wp.vec3),
-    weight: wp.array(dtype=float),
-    transmittance: wp.array(dtype=float),
-    depth: wp.array(dtype=float),
-    variance: wp.array(dtype=float),
-    rgb: wp.array(dtype=wp.vec3),
+    ray_origin: wp.array[wp.vec3],
+    ray_direction: wp.array[wp.vec3],
+    z: wp.array[float],
+    order: wp.array[int],
+    density: wp.array[float],
+    color: wp.array[wp.vec3],
+    weight: wp.array[float],
+    transmittance: wp.array[float],
+    depth: wp.array[float],
+    variance: wp.array[float],
+    rgb: wp.array[wp.vec3],
 ):
     """Weight of, and transmittance in front of, each of the ``visible`` samples; depth, variance, colour."""
     ray = start + wp.tid()
@@ -210,22 +210,22 @@ def composite_backward(
     start: int,
     visible: int,
     sample_count: int,
-    keep: wp.array(dtype=int),
+    keep: wp.array[int],
     low: wp.vec3,
     high: wp.vec3,
-    ray_origin: wp.array(dtype=wp.vec3),
-    ray_direction: wp.array(dtype=wp.vec3),
-    z: wp.array(dtype=float),
-    order: wp.array(dtype=int),
-    density: wp.array(dtype=float),
-    color: wp.array(dtype=wp.vec3),
-    weight: wp.array(dtype=float),
-    transmittance: wp.array(dtype=float),
-    depth_grad: wp.array(dtype=float),
-    rgb_grad: wp.array(dtype=wp.vec3),
+    ray_origin: wp.array[wp.vec3],
+    ray_direction: wp.array[wp.vec3],
+    z: wp.array[float],
+    order: wp.array[int],
+    density: wp.array[float],
+    color: wp.array[wp.vec3],
+    weight: wp.array[float],
+    transmittance: wp.array[float],
+    depth_grad: wp.array[float],
+    rgb_grad: wp.array[wp.vec3],
     empty_weight: float,
-    density_grad: wp.array(dtype=float),
-    color_grad: wp.array(dtype=wp.vec3),
+    density_grad: wp.array[float],
+    color_grad: wp.array[wp.vec3],
 ):
     """Adjoint of `composite`; samples behind the ``visible`` ones get that of ``empty_weight`` |density|."""
     ray = start + wp.tid()
@@ -267,9 +267,9 @@ def empty_loss(
     visible: int,
     sample_count: int,
     empty_weight: float,
-    keep: wp.array(dtype=int),
-    density: wp.array(dtype=float),
-    loss: wp.array(dtype=float),
+    keep: wp.array[int],
+    density: wp.array[float],
+    loss: wp.array[float],
 ):
     ray = wp.tid()
     if keep[ray] != 0:

@@ -80,11 +80,11 @@ def imap_kernels(target: str) -> SimpleNamespace:
         first_sample: int,
         width: int,
         sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
-        W: wp.array(dtype=Vec32),
-        embedding: wp.array2d(dtype=Vec32),
+        ray_origin: wp.array[wp.vec3],
+        ray_direction: wp.array[wp.vec3],
+        z: wp.array[float],
+        W: wp.array[Vec32],
+        embedding: wp.array2d[Vec32],
     ):
         point = sample_index(wp.tid(), first_ray, first_sample, width, sample_count)
         p = sample_point(point, sample_count, ray_origin, ray_direction, z)
@@ -100,14 +100,14 @@ def imap_kernels(target: str) -> SimpleNamespace:
         sample_count: int,
         trips: int,
         in_blocks: int,
-        W: wp.array(dtype=Vec32),
+        W: wp.array[Vec32],
         row: int,
-        bias: wp.array(dtype=Vec32),
+        bias: wp.array[Vec32],
         bias_row: int,
-        x: wp.array2d(dtype=Vec32),
+        x: wp.array2d[Vec32],
         mode: int,
-        gate: wp.array2d(dtype=Vec32),
-        y: wp.array2d(dtype=Vec32),
+        gate: wp.array2d[Vec32],
+        y: wp.array2d[Vec32],
     ):
         """A layer forward (FORWARD: bias and ReLU), or its adjoint (ADJOINT: masked by ``gate``; UNMASKED)."""
         block, group = wp.tid()
@@ -165,10 +165,10 @@ def imap_kernels(target: str) -> SimpleNamespace:
         first_sample: int,
         width: int,
         sample_count: int,
-        W: wp.array(dtype=Vec32),
-        h: wp.array2d(dtype=Vec32),
-        color: wp.array(dtype=wp.vec3),
-        density: wp.array(dtype=float),
+        W: wp.array[Vec32],
+        h: wp.array2d[Vec32],
+        color: wp.array[wp.vec3],
+        density: wp.array[float],
     ):
         point = sample_index(wp.tid(), first_ray, first_sample, width, sample_count)
         raw = wp.vec4()
@@ -183,11 +183,11 @@ def imap_kernels(target: str) -> SimpleNamespace:
     @kernel
     def output_backward(
         start: int,
-        W: wp.array(dtype=Vec32),
-        h: wp.array2d(dtype=Vec32),
-        color_grad: wp.array(dtype=wp.vec3),
-        density_grad: wp.array(dtype=float),
-        d: wp.array2d(dtype=Vec32),
+        W: wp.array[Vec32],
+        h: wp.array2d[Vec32],
+        color_grad: wp.array[wp.vec3],
+        density_grad: wp.array[float],
+        d: wp.array2d[Vec32],
     ):
         point = start + wp.tid()
         c = color_grad[point]
@@ -200,13 +200,13 @@ def imap_kernels(target: str) -> SimpleNamespace:
     def embed_backward(
         start: int,
         sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
-        W: wp.array(dtype=Vec32),
-        d: wp.array2d(dtype=Vec32),
+        ray_origin: wp.array[wp.vec3],
+        ray_direction: wp.array[wp.vec3],
+        z: wp.array[float],
+        W: wp.array[Vec32],
+        d: wp.array2d[Vec32],
         want_point: int,
-        point_grad: wp.array(dtype=wp.vec3),
+        point_grad: wp.array[wp.vec3],
     ):
         """From the gradient of the embedding to that of its angles p B (in place), and of the point."""
         point = start + wp.tid()
@@ -231,9 +231,9 @@ def imap_kernels(target: str) -> SimpleNamespace:
         slot: int,
         in_blocks: int,
         row: int,
-        x: wp.array3d(dtype=float),
-        d: wp.array2d(dtype=Vec32),
-        grad: wp.array2d(dtype=Vec32),
+        x: wp.array3d[float],
+        d: wp.array2d[Vec32],
+        grad: wp.array2d[Vec32],
     ):
         """x^T d over a chunk of points: rows 8 r to 8 r + 7 of the input, one block of the output, a thread.
 
@@ -279,8 +279,8 @@ def imap_kernels(target: str) -> SimpleNamespace:
         chunk_size: int,
         slot: int,
         row: int,
-        d: wp.array2d(dtype=Vec32),
-        grad: wp.array2d(dtype=Vec32),
+        d: wp.array2d[Vec32],
+        grad: wp.array2d[Vec32],
     ):
         chunk, block = wp.tid()
         first = start + chunk * chunk_size
@@ -296,10 +296,10 @@ def imap_kernels(target: str) -> SimpleNamespace:
         stop: int,
         chunk_size: int,
         slot: int,
-        h: wp.array2d(dtype=Vec32),
-        color_grad: wp.array(dtype=wp.vec3),
-        density_grad: wp.array(dtype=float),
-        grad: wp.array2d(dtype=Vec32),
+        h: wp.array2d[Vec32],
+        color_grad: wp.array[wp.vec3],
+        density_grad: wp.array[float],
+        grad: wp.array2d[Vec32],
     ):
         chunk, block = wp.tid()
         first = start + chunk * chunk_size
@@ -335,11 +335,11 @@ def imap_kernels(target: str) -> SimpleNamespace:
         chunk_size: int,
         slot: int,
         sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
-        d: wp.array2d(dtype=Vec32),
-        grad: wp.array2d(dtype=Vec32),
+        ray_origin: wp.array[wp.vec3],
+        ray_direction: wp.array[wp.vec3],
+        z: wp.array[float],
+        d: wp.array2d[Vec32],
+        grad: wp.array2d[Vec32],
     ):
         """Gradient of B, after `embed_backward`."""
         chunk, third = wp.tid()
@@ -358,7 +358,7 @@ def imap_kernels(target: str) -> SimpleNamespace:
         wp.atomic_add(grad, slot, 3 * third + 2, gz)
 
     @kernel
-    def transpose(in_blocks: int, row: int, row_T: int, W: wp.array(dtype=Vec32), T: wp.array(dtype=Vec32)):
+    def transpose(in_blocks: int, row: int, row_T: int, W: wp.array[Vec32], T: wp.array[Vec32]):
         """Bring a layer's transposed rows in line with its weights: one thread a row of ``T``."""
         tid = wp.tid()
         source = tid // 256

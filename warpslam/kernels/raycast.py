@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def texel(texels: wp.array(dtype=wp.vec3ub), first: int, width: int, height: int, x: int, y: int):
+def texel(texels: wp.array[wp.vec3ub], first: int, width: int, height: int, x: int, y: int):
     """Colour of one texel, 0..255; outside of [0, 1] a texture repeats."""
     column = ((x % width) + width) % width
     row = ((y % height) + height) % height
@@ -18,7 +18,7 @@ def texel(texels: wp.array(dtype=wp.vec3ub), first: int, width: int, height: int
 
 
 @wp.func
-def bilinear(texels: wp.array(dtype=wp.vec3ub), first: int, width: int, height: int, uv: wp.vec2):
+def bilinear(texels: wp.array[wp.vec3ub], first: int, width: int, height: int, uv: wp.vec2):
     """Blend of the four texels around a texture coordinate."""
     x = uv[0] * float(width) - 0.5
     # Row 0 of the image is its top, v = 1.
@@ -39,13 +39,13 @@ def bilinear(texels: wp.array(dtype=wp.vec3ub), first: int, width: int, height: 
 @wp.kernel
 def render_mesh(
     mesh: wp.uint64,
-    faces: wp.array(dtype=wp.int32),  # (3 F,)
-    colors: wp.array(dtype=wp.vec3),  # (V,) 0..255
-    uvs: wp.array(dtype=wp.vec2),  # (V,)
-    shade: wp.array(dtype=wp.float32),  # (F,)
-    material: wp.array(dtype=wp.int32),  # (F,), -1 = vertex colours
-    textures: wp.array(dtype=wp.vec3i),  # (M,): first texel, width, height
-    texels: wp.array(dtype=wp.vec3ub),  # (T,)
+    faces: wp.array[wp.int32],  # (3 F,)
+    colors: wp.array[wp.vec3],  # (V,) 0..255
+    uvs: wp.array[wp.vec2],  # (V,)
+    shade: wp.array[wp.float32],  # (F,)
+    material: wp.array[wp.int32],  # (F,), -1 = vertex colours
+    textures: wp.array[wp.vec3i],  # (M,): first texel, width, height
+    texels: wp.array[wp.vec3ub],  # (T,)
     fx: float,
     fy: float,
     cx: float,
@@ -53,8 +53,8 @@ def render_mesh(
     rotation: wp.mat33,  # camera to world
     origin: wp.vec3,
     max_depth: float,
-    rgb: wp.array(dtype=wp.vec3ub, ndim=2),  # (H, W)
-    depth: wp.array(dtype=wp.float32, ndim=2),  # (H, W) [m], 0 = miss
+    rgb: wp.array2d[wp.vec3ub],  # (H, W)
+    depth: wp.array2d[wp.float32],  # (H, W) [m], 0 = miss
 ):
     """Cast the ray of one pixel and write its colour and z-depth."""
     j, i = wp.tid()

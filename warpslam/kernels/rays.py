@@ -54,24 +54,24 @@ def cell_pixel(cell: int, cells: wp.vec2i, width: int, height: int, x: float, y:
 
 @wp.kernel(enable_backward=False)
 def draw_pixels(
-    seeds: wp.array(dtype=int),
-    iteration: wp.array(dtype=int),
+    seeds: wp.array[int],
+    iteration: wp.array[int],
     rays_per_frame: int,
-    window: wp.array(dtype=int),
+    window: wp.array[int],
     edge_u: int,
     edge_v: int,
     focal: wp.vec2,
     center: wp.vec2,
-    rgb_images: wp.array(dtype=wp.uint8, ndim=4),
-    depth_images: wp.array(dtype=wp.uint16, ndim=3),
-    depth_scales: wp.array(dtype=float),
+    rgb_images: wp.array4d[wp.uint8],
+    depth_images: wp.array3d[wp.uint16],
+    depth_scales: wp.array[float],
     active_share: float,
     cells: wp.vec2i,
-    cumulative_error: wp.array2d(dtype=float),
-    frame: wp.array(dtype=int),
-    direction_camera: wp.array(dtype=wp.vec3),
-    depth: wp.array(dtype=float),
-    rgb: wp.array(dtype=wp.vec3),
+    cumulative_error: wp.array2d[float],
+    frame: wp.array[int],
+    direction_camera: wp.array[wp.vec3],
+    depth: wp.array[float],
+    rgb: wp.array[wp.vec3],
 ):
     """Random pixels, with replacement; ``window[f]`` is the image slot of frame f of the window.
 
@@ -114,17 +114,17 @@ def draw_pixels(
 
 @wp.kernel(enable_backward=False)
 def probe_pixels(
-    seeds: wp.array(dtype=int),
-    iteration: wp.array(dtype=int),
-    window: wp.array(dtype=int),
+    seeds: wp.array[int],
+    iteration: wp.array[int],
+    window: wp.array[int],
     cells: wp.vec2i,
     focal: wp.vec2,
     center: wp.vec2,
-    depth_images: wp.array(dtype=wp.uint16, ndim=3),
-    depth_scales: wp.array(dtype=float),
-    frame: wp.array(dtype=int),
-    direction_camera: wp.array(dtype=wp.vec3),
-    depth: wp.array(dtype=float),
+    depth_images: wp.array3d[wp.uint16],
+    depth_scales: wp.array[float],
+    frame: wp.array[int],
+    direction_camera: wp.array[wp.vec3],
+    depth: wp.array[float],
 ):
     """One random pixel in each cell of each image of the window: where to look for the error of the cell."""
     tid = wp.tid()
@@ -140,9 +140,7 @@ def probe_pixels(
 
 
 @wp.func
-def least_and_largest_depth(
-    image: wp.array(dtype=wp.uint16, ndim=3), slot: int, scale: float, pixel: wp.vec2i
-) -> wp.vec2:
+def least_and_largest_depth(image: wp.array3d[wp.uint16], slot: int, scale: float, pixel: wp.vec2i) -> wp.vec2:
     """Of a pixel and its eight neighbours; (0, 0) if one of them is missing or outside."""
     least = float(1.0e30)
     largest = float(0.0)
@@ -163,11 +161,11 @@ def least_and_largest_depth(
 @wp.kernel(enable_backward=False)
 def drop_unseen(
     lattice: Lattice,
-    seen: wp.array(dtype=wp.uint8),
-    ray_origin: wp.array(dtype=wp.vec3),
-    ray_direction: wp.array(dtype=wp.vec3),
-    depth: wp.array(dtype=float),
-    keep: wp.array(dtype=int),
+    seen: wp.array[wp.uint8],
+    ray_origin: wp.array[wp.vec3],
+    ray_direction: wp.array[wp.vec3],
+    depth: wp.array[float],
+    keep: wp.array[int],
 ):
     """Leave out rays that end in a cell with a vertex that no mapped frame has seen."""
     tid = wp.tid()
@@ -188,13 +186,13 @@ def drop_contradicted(
     T_camera_world: wp.mat44,
     focal: wp.vec2,
     center: wp.vec2,
-    depth_images: wp.array(dtype=wp.uint16, ndim=3),
-    depth_scales: wp.array(dtype=float),
-    frame: wp.array(dtype=int),
-    origin: wp.array(dtype=wp.vec3),
-    direction: wp.array(dtype=wp.vec3),
-    depth: wp.array(dtype=float),
-    keep: wp.array(dtype=int),
+    depth_images: wp.array3d[wp.uint16],
+    depth_scales: wp.array[float],
+    frame: wp.array[int],
+    origin: wp.array[wp.vec3],
+    direction: wp.array[wp.vec3],
+    depth: wp.array[float],
+    keep: wp.array[int],
 ):
     """Leave out the rays of earlier frames that the current depth image, in slot 0, contradicts by ``margin``: it sees
     through the point they measured, or measures a surface that they pass through.
@@ -223,10 +221,10 @@ def drop_contradicted(
 def accumulate_errors(
     cell_count: int,
     largest: float,
-    keep: wp.array(dtype=int),
-    measured_depth: wp.array(dtype=float),
-    depth: wp.array(dtype=float),
-    cumulative_error: wp.array2d(dtype=float),
+    keep: wp.array[int],
+    measured_depth: wp.array[float],
+    depth: wp.array[float],
+    cumulative_error: wp.array2d[float],
 ):
     """Running sums of |D - D^|, at most ``largest``, over the cells of an image, one image a thread."""
     f = wp.tid()
@@ -247,8 +245,8 @@ def grid_pixels(
     stride: int,
     focal: wp.vec2,
     center: wp.vec2,
-    frame: wp.array(dtype=int),
-    direction_camera: wp.array(dtype=wp.vec3),
+    frame: wp.array[int],
+    direction_camera: wp.array[wp.vec3],
 ):
     """Rays of consecutive pixels, row by row, every ``stride``-th pixel: for whole images."""
     tid = wp.tid()
@@ -260,11 +258,11 @@ def grid_pixels(
 
 @wp.kernel
 def cast_rays(
-    poses: wp.array(dtype=float, ndim=2),
-    frame: wp.array(dtype=int),
-    direction_camera: wp.array(dtype=wp.vec3),
-    ray_origin: wp.array(dtype=wp.vec3),
-    ray_direction: wp.array(dtype=wp.vec3),
+    poses: wp.array2d[float],
+    frame: wp.array[int],
+    direction_camera: wp.array[wp.vec3],
+    ray_origin: wp.array[wp.vec3],
+    ray_direction: wp.array[wp.vec3],
 ):
     tid = wp.tid()
     f = frame[tid]
@@ -277,13 +275,13 @@ def cast_rays(
 def bound_rays(
     low: wp.vec3,
     high: wp.vec3,
-    ray_origin: wp.array(dtype=wp.vec3),
-    ray_direction: wp.array(dtype=wp.vec3),
-    depth: wp.array(dtype=float),
+    ray_origin: wp.array[wp.vec3],
+    ray_direction: wp.array[wp.vec3],
+    depth: wp.array[float],
     use_depth: int,
-    t_exit: wp.array(dtype=float),
-    keep: wp.array(dtype=int),
-    max_depth: wp.array(dtype=float),
+    t_exit: wp.array[float],
+    keep: wp.array[int],
+    max_depth: wp.array[float],
 ):
     """Exit distance from the map's bound, whether the ray is kept, and the largest depth of the kept rays."""
     tid = wp.tid()
@@ -341,7 +339,7 @@ def place_ray(
     max_depth: float,
     jitter: int,
     state: wp.uint32,
-    z: wp.array(dtype=float),
+    z: wp.array[float],
 ):
     # Both sequences ascend, so that sorting is one merge.
     total = count + surface_count
@@ -370,17 +368,17 @@ def place_ray(
 @wp.kernel(enable_backward=False)
 def place_samples(
     start: int,
-    seeds: wp.array(dtype=int),
-    iteration: wp.array(dtype=int),
+    seeds: wp.array[int],
+    iteration: wp.array[int],
     jitter: int,
     count: int,
     surface_count: int,
     use_depth: int,
-    depth: wp.array(dtype=float),
-    t_exit: wp.array(dtype=float),
-    keep: wp.array(dtype=int),
-    max_depth: wp.array(dtype=float),
-    z: wp.array(dtype=float),
+    depth: wp.array[float],
+    t_exit: wp.array[float],
+    keep: wp.array[int],
+    max_depth: wp.array[float],
+    z: wp.array[float],
 ):
     tid = start + wp.tid()
     if keep[tid] == 0:
@@ -402,12 +400,12 @@ def place_samples(
 def collect_ray_gradients(
     start: int,
     sample_count: int,
-    keep: wp.array(dtype=int),
-    counts: wp.array(dtype=int),
-    z: wp.array(dtype=float),
-    point_grad: wp.array(dtype=wp.vec3),
-    origin_grad: wp.array(dtype=wp.vec3),
-    direction_grad: wp.array(dtype=wp.vec3),
+    keep: wp.array[int],
+    counts: wp.array[int],
+    z: wp.array[float],
+    point_grad: wp.array[wp.vec3],
+    origin_grad: wp.array[wp.vec3],
+    direction_grad: wp.array[wp.vec3],
 ):
     """Adjoint of p = o + z d, summed over the samples of a ray that ``counts``; clears ``point_grad`` for the next
     iteration.
