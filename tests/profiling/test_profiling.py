@@ -17,6 +17,7 @@ from warpslam import cli
 from warpslam.camera import Intrinsics
 from warpslam.errors import WarpSlamError
 from warpslam.field.arrays import Thresholds
+from warpslam.field.passes import render
 from warpslam.profiling import costs, recorder
 from warpslam.runtime import launching, phases
 from warpslam.runtime.phases import phase
@@ -32,8 +33,8 @@ KERNELS = {
     "list_weighty", "list_steep", "composite_backward", "collect_ray_gradients", "mapping_loss",
     "mapping_loss (adjoint)", "tracking_loss",
     "tracking_loss (adjoint)", "cast_rays (adjoint)", "tracking_residuals", "choose_inliers", "lower_median",
-    "adam_rows", "adam_poses", "advance_step", "note_pose", "transpose_color_weights", "_classify_kernel",
-    "_facing_kernel",
+    "adam_rows", "adam_poses", "advance_step", "note_pose", "transpose_color_weights", "classify_points",
+    "find_facing",
 }  # fmt: skip
 HOOKED = (
     (warp_context, "invoke"), (wp, "launch"), (wp.Launch, "launch"), (wp.Module, "load"), (launching, "_pool"),
@@ -230,7 +231,7 @@ def test_counted_points_are_those_computed(frames, min_transmittance, monkeypatc
     for bits in {id(array): array for array in batch.bits.values()}.values():
         bits.fill_(0xFFFFFFFF)
     with warpslam.profile() as profile:
-        batch.render(arrays, "color", thresholds=thresholds)
+        render(batch, arrays, "color", thresholds=thresholds)
     counted = Counter()
     for launch in profile.launches:
         assert launch.work.counted or not launch.kernel.endswith("_forward")

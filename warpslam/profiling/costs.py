@@ -47,7 +47,7 @@ NOTHING = Work()
 
 
 class Arguments:
-    """Arguments of a launch by name, either packed for the CPU (``values`` ctypes) or as they were given."""
+    """Arguments of a launch by name, fields of structs as ``argument.field``, either packed for the CPU (``values`` ctypes) or as they were given."""
 
     def __init__(self, kernel: wp.Kernel, values: Sequence[Any], *, readable: bool) -> None:
         self._position = _positions(kernel)
@@ -55,12 +55,12 @@ class Arguments:
 
     def number(self, name: str) -> Any:
         """A number."""
-        value = self._values[self._position[name]]
+        value = self._find(name)
         return value.value if hasattr(value, "value") else value
 
     def shape(self, name: str) -> Sequence[int]:
         """Shape of an array."""
-        return self._values[self._position[name]].shape
+        return self._find(name).shape
 
     def floats(self, name: str, first: int, stop: int) -> np.ndarray:
         """Entries ``first`` to ``stop`` of a contiguous float32 array, without a copy.
@@ -79,10 +79,17 @@ class Arguments:
         return ctypes.c_int32.from_address(self._address(name, index)).value
 
     def _address(self, name: str, index: int) -> int:
-        position = self._position[name]
+        value = self._find(name)
         if not self._readable:
             raise KeyError(name)
-        return self._values[position].data + 4 * index
+        return value.data + 4 * index
+
+    def _find(self, name: str) -> Any:
+        argument, *fields = name.split(".")
+        value = self._values[self._position[argument]]
+        for part in fields:
+            value = getattr(value, part)
+        return value
 
 
 @cache
@@ -134,7 +141,7 @@ def _forward(level: str) -> Model:
     each = flops_per_point(level)
 
     def work(threads: int, arguments: Arguments) -> Work:
-        every = arguments.number("point_count")
+        every = arguments.number("span.point_count")
         try:
             points = _points_of_going_rays(every, arguments)
         except KeyError:
@@ -146,7 +153,7 @@ def _forward(level: str) -> Model:
 
 def _points_of_going_rays(every: int, arguments: Arguments) -> int:
     """Samples on rays that are not spent yet."""
-    first, width = arguments.number("first_ray"), arguments.number("width")
+    first, width = arguments.number("span.first_ray"), arguments.number("span.width")
     transmittance = arguments.floats("transmittance", first, first + every // width)
     return int(np.count_nonzero(transmittance >= arguments.number("min_transmittance"))) * width
 
@@ -162,7 +169,7 @@ def _backward(level: str | None = None) -> Model:
         each = backward_flops(
             level or _level_of(arguments),
             points=bool(_optional(arguments, "want_point")),
-            weights=bool(_optional(arguments, "want_weights")),
+            weights=bool(_optional(arguments, "weights.wanted")),
         )
         return _listed(each, threads, arguments)
 
@@ -174,7 +181,7 @@ def _listed(each: int, threads: int, arguments: Arguments) -> Work:
     from warpslam.kernels.compositing import COUNT_STRIDE
 
     try:
-        points = arguments.integer("listed_count", COUNT_STRIDE * arguments.number("slot"))
+        points = arguments.integer("listed.counts", COUNT_STRIDE * arguments.number("listed.slot"))
     except KeyError:
         return Work(threads, each * threads, counted=False)
     return Work(points, each * points)
@@ -188,7 +195,7 @@ def _optional(arguments: Arguments, name: str) -> Any:
 
 
 def _level_of(arguments: Arguments) -> str:
-    from warpslam.kernels.decoder import OUT_64
+    from warpslam.kernels.decoder.layout import OUT_64
 
     return "fine" if arguments.number("output_row") == OUT_64 else "middle"
 
@@ -232,19 +239,17 @@ _MODELS: dict[str, Model] = {
     "color_weights": _sum_of_color_weights,
     "composite": _samples("width"),
     **{
-        name: _samples("sample_count")
+        name: _samples("rays.sample_count")
         for name in (
             "ray_variance",
-            "composite_color",
             "composite_backward",
-            "list_weighty",
-            "list_steep",
             "surface_depth",
             "collect_ray_gradients",
             "ray_derivatives",
             "ray_jacobians",
         )
     },  # fmt: skip
+    **{name: _samples("sample_count") for name in ("composite_color", "list_weighty", "list_steep")},
     "adam_rows": _adam_rows,
     "clear_moments": _rows(2),
     "transpose_color_weights": _rows(2),
