@@ -50,30 +50,30 @@ class Ours:
             self.slam.step(frame.rgb, frame.depth, T_world_camera=frame.T_world_camera)
         last = self.frames[5]
         self.slam.scene.cover(*measured_extent(last.depth, last.T_world_camera, self.slam.intrinsics))
-        self.slam._images.set(0, last.rgb, last.depth)
-        self.vector = vector_from_pose(last.T_world_camera)
+        self.slam.images.set(0, last.rgb, last.depth)
+        self.pose = last.T_world_camera
 
     def map_call(self, iterations: int, stage: str | None = None, *, whole: bool = False) -> None:
         """A mapping call; with a stage, all iterations are of that stage (but for the first)."""
-        config = self.slam._mapper.config
+        config = self.slam.mapper.config
         config.iterations = iterations
         config.middle_share, config.fine_share = STAGES[stage] if stage else (0.4, 0.6)
         config.coarse, config.bundle_adjustment = whole, whole
         keyframes = self.slam.keyframes
-        self.slam._mapper.map_frame(self.slam._images, 5, self.vector, keyframes)
+        self.slam.mapper.map_frame(self.slam.images, 5, self.pose, keyframes)
 
     def map_first(self, iterations: int) -> None:
         """Iterations of the first frame, at its rates."""
-        config = self.slam._mapper.config
+        config = self.slam.mapper.config
         config.first_iterations, config.coarse = iterations, False
         config.middle_share, config.fine_share = 0.4, 0.6
-        self.slam._mapper.map_first(self.slam._images, 5, self.vector)
+        self.slam.mapper.map_first(self.slam.images, 5, self.pose)
 
     def track(self, optimizer: str, iterations: int) -> None:
         """Tracking with a number of iterations, 200 rays."""
-        config = self.slam._tracker.config
+        config = self.slam.tracker.config
         config.optimizer, config.iterations, config.keep_best = optimizer, iterations, "last"
-        self.slam._tracker.track(self.slam.scene.arrays(), self.slam._images, 5, self.frames[5].T_world_camera)
+        self.slam.tracker.track(self.slam.scene.arrays(), self.slam.images, 5, self.frames[5].T_world_camera)
 
 
 def torch_twin(ours: Ours) -> tuple[TorchSlam, dict[str, np.ndarray], TorchSlam]:
@@ -91,7 +91,7 @@ def torch_twin(ours: Ours) -> tuple[TorchSlam, dict[str, np.ndarray], TorchSlam]
     masks = {}
     for level in levels:
         mask = np.zeros(scene.grids[level].row_count, bool)
-        mask[ours.slam._mapper._grids[level].rows.numpy()] = True
+        mask[ours.slam.mapper._grids[level].rows.numpy()] = True
         masks[level] = mask
     decoders = {weights.level: weights for weights in scene.decoder_weights}
     chosen = [ours.frames[5], *ours.frames[1:5]]
@@ -129,7 +129,7 @@ def launching_share(ours: Ours, optimizer: str, repeats: int) -> float:
     def run() -> None:
         ours.track(optimizer, 100)
 
-    ours.slam._tracker._launcher.forget()
+    ours.slam.tracker._launcher.forget()
     Launcher.command = command
     try:
         run()  # records the launches
@@ -198,8 +198,8 @@ def main(arguments: list[str] | None = None) -> int:
         for _ in range(n):
             alone.track_once(200)
 
-    ours.slam._tracker.config.pixels = 200
-    ours.slam._tracker._batch = ours.slam._tracker._new_batch(200)
+    ours.slam.tracker.config.pixels = 200
+    ours.slam.tracker._batch = ours.slam.tracker._new_batch(200)
     pairs = {"tracking, Adam": (lambda: ours.track("adam", n), torch_tracking)}
     pairs["tracking, Gauss-Newton"] = (lambda: ours.track("gauss_newton", n), torch_tracking)
     for stage in STAGES:

@@ -36,12 +36,12 @@ from warpslam.frames import FrameResult
 from warpslam.kernels import adam, losses, rays
 from warpslam.kernels import imap_density as density
 from warpslam.kernels import imap_network as imap
-from warpslam.meshing import ObservedView, extract_mesh
+from warpslam.meshing import extract_mesh
 from warpslam.poses import check_transform, pose_from_vector, vector_from_pose
 from warpslam.runtime.launching import Launcher, synchronize
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
-from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
+from warpslam.scene.mapped_views import ObservedView, SeenDepth
 from warpslam.scene.optimizers import PoseOptimizer, RowOptimizer
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ class Imap(Baseline):
             return timings
         if self._mapped != index:
             start = time.perf_counter()
-            self._map(index, self._images.depth_image(0) / np.float32(settings.scale), first=False)
+            self._map(index, self._images.current_depth() / np.float32(settings.scale), first=False)
             timings["mapping"] = time.perf_counter() - start
         if self.config.mapping.color_refinement:
             start = time.perf_counter()
@@ -276,8 +276,7 @@ class Imap(Baseline):
         return np.concatenate([vector[:4], vector[4:] * (self._settings.scale if scale is None else scale)])
 
     def _view(self, seen: SeenDepth) -> ObservedView:
-        camera = self.intrinsics.strided(SEEN_STRIDE)
-        return ObservedView(seen.depth(), camera, pose_from_vector(self._vectors[seen.index]))
+        return seen.view(self.intrinsics, pose_from_vector(self._vectors[seen.index]))
 
     # -- what came out -------------------------------------------------------------------------------------------
 

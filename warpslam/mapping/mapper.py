@@ -43,18 +43,16 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class MappingResult:
-    """Outcome of one mapping call.
+    """Outcome of one mapping call."""
 
-    vector: Pose vector of the current frame, refined if bundle adjustment ran.
-    losses: Mean loss per kept ray in the last iteration of each stage.
-    window: Frame numbers of the keyframes that took part.
-    adjusted: Whether poses were refined.
-    """
-
-    vector: np.ndarray
+    pose: np.ndarray
+    """T_world_camera of the current frame (4, 4), refined if bundle adjustment ran."""
     losses: dict[str, float] = field(default_factory=dict)
+    """Mean loss per kept ray in the last iteration of each stage."""
     window: list[int] = field(default_factory=list)
+    """Frame numbers of the keyframes that took part."""
     adjusted: bool = False
+    """Whether poses were refined."""
 
 
 class Mapper:
@@ -94,45 +92,45 @@ class Mapper:
         self._frozen = {level for level, is_optimized in wanted.items() if not is_optimized}
 
     def map_first(
-        self, images: ImagePool, frame: int, vector: np.ndarray, on_iteration: Callable | None = None
+        self, images: ImagePool, frame: int, pose: np.ndarray, on_iteration: Callable | None = None
     ) -> MappingResult:
         """The first frame: many iterations at higher rates."""
-        return self.start_first(images, frame, vector, on_iteration)()
+        return self.start_first(images, frame, pose, on_iteration)()
 
-    def map_frame(self, images: ImagePool, frame: int, vector: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
+    def map_frame(self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
         """A later frame: window, frustum selection, three stages, bundle adjustment once there are enough keyframes."""
-        return self.start_frame(images, frame, vector, keyframes)()
+        return self.start_frame(images, frame, pose, keyframes)()
 
     def start_first(
-        self, images: ImagePool, frame: int, vector: np.ndarray, on_iteration: Callable | None = None
+        self, images: ImagePool, frame: int, pose: np.ndarray, on_iteration: Callable | None = None
     ) -> Callable[[], MappingResult]:
         """`map_first` without waiting for the device: the function that is returned waits, and reads the outcome."""
         config = self.config
         return self._optimize(
-            images, frame, vector, [], config.first_iterations, config.first_rate_factor, on_iteration=on_iteration
+            images, frame, pose, [], config.first_iterations, config.first_rate_factor, on_iteration=on_iteration
         )
 
     def start_frame(
-        self, images: ImagePool, frame: int, vector: np.ndarray, keyframes: list[Keyframe]
+        self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe]
     ) -> Callable[[], MappingResult]:
         """`map_frame` without waiting for the device: the function that is returned waits, and reads the outcome."""
-        return self._optimize(images, frame, vector, keyframes, self.config.iterations, 1.0)
+        return self._optimize(images, frame, pose, keyframes, self.config.iterations, 1.0)
 
     def refine(
         self,
         images: ImagePool,
         frame: int,
-        vector: np.ndarray,
+        pose: np.ndarray,
         keyframes: list[Keyframe],
         rounds: range,
     ) -> MappingResult:
         """Final colour refinement: a doubled window, all vertices, colour stage only, colour decoder fixed, several
         rounds, whose numbers are part of the seeds.
         """
-        result = MappingResult(vector)
+        result = MappingResult(pose)
         for round_ in rounds:
             result = self._optimize(
-                images, frame, result.vector, keyframes, self.config.iterations, 1.0, refinement=True, round_=round_
+                images, frame, result.pose, keyframes, self.config.iterations, 1.0, refinement=True, round_=round_
             )()
         return result
 
@@ -146,7 +144,7 @@ class Mapper:
         self,
         images: ImagePool,
         frame: int,
-        vector: np.ndarray,
+        pose: np.ndarray,
         keyframes: list[Keyframe],
         iterations: int,
         rate_factor: float,
@@ -159,7 +157,7 @@ class Mapper:
         config = self.config
         rng = np.random.default_rng([self.seed, 2, frame, round_])
         size = config.window * (2 if refinement else 1)
-        window = self._choose_window(images, vector, keyframes, size, rng)
+        window = self._choose_window(images, pose, keyframes, size, rng)
         coarse = self._choose_coarse_window(keyframes, rng) if config.coarse and not refinement else []
         adjust = (
             config.bundle_adjustment
@@ -169,19 +167,18 @@ class Mapper:
         # The oldest keyframe holds the window in place: it comes first, and its pose stays.
         window.sort(key=lambda keyframe: keyframe.index)
         rates = np.full((1, 2), config.bundle_adjustment_rate)
-        self._poses.begin(np.stack([*(keyframe.pose for keyframe in window), vector]), rates)
+        self._poses.begin(_vectors(window, pose), rates)
         # Both windows at once: they must be on the device together.
         in_use = images.bring([keyframe.image for keyframe in (*window, *coarse)])
         slots = wp.array([*in_use[: len(window)], 0], dtype=int, device=self.device)
-        T_world_camera = pose_from_vector(vector)
-        self._select(images, T_world_camera, everything=refinement)
+        self._select(images, pose, everything=refinement)
         ray_counts: dict[str, int] = {}
         self._launcher.forget()
 
         if config.coarse and not refinement:
             coarse_slots = wp.array([*in_use[len(window) :], 0], dtype=int, device=self.device)
-            poses = np.stack([*(keyframe.pose for keyframe in coarse), vector]).astype(np.float32)
-            coarse_poses = wp.array(poses, dtype=float, device=self.device)
+            vectors = _vectors(coarse, pose).astype(np.float32)
+            coarse_poses = wp.array(vectors, dtype=float, device=self.device)
             count = config.first_iterations if not keyframes and rate_factor != 1.0 else config.coarse_iterations
             self._run_coarse(images, frame, coarse_slots, coarse_poses, count, rate_factor)
             self._note_loss("coarse", ray_counts)
@@ -194,7 +191,7 @@ class Mapper:
                 self._errors.measure(self.scene.arrays(), images.arrays, slots, self._poses.poses, self.camera, seed)
 
             def iterate(stage: str = stage) -> None:
-                self._iterate(images, slots, T_world_camera, stage, rate_factor, adjust, refinement)
+                self._iterate(images, slots, pose, stage, rate_factor, adjust, refinement)
 
             self._launcher.iterate(stage, (), iterate)
             last_of_stage = iteration + 1 == len(stages) or stages[iteration + 1] != stage
@@ -208,14 +205,15 @@ class Mapper:
             for name, optimizer in (*self._grids.items(), ("colour decoder", self._decoder)):
                 if optimizer.has_rejected:
                     _log.warning("frame %d: gradients of the %s were not finite and have been left out", frame, name)
-            result = MappingResult(vector, window=[keyframe.index for keyframe in window], adjusted=adjust)
+            result = MappingResult(pose, window=[keyframe.index for keyframe in window], adjusted=adjust)
             losses = self._losses.numpy()
             result.losses = {s: float(losses[STAGES.index(s)]) / max(count, 1) for s, count in ray_counts.items()}
             if adjust:
-                vectors = self._poses.vectors()
-                for keyframe, refined in zip(window[1:], vectors[1:-1], strict=True):
-                    keyframe.pose = _normalized(refined)
-                result.vector = _normalized(vectors[-1])
+                # Adam moves the length of a quaternion freely, which changes nothing but the step sizes.
+                poses = [pose_from_vector(vector) for vector in self._poses.vectors()]
+                for keyframe, refined in zip(window[1:], poses[1:-1], strict=True):
+                    keyframe.pose = refined
+                result.pose = poses[-1]
             return result
 
         return outcome
@@ -231,7 +229,7 @@ class Mapper:
 
     @phase("keyframe selection")
     def _choose_window(
-        self, images: ImagePool, vector: np.ndarray, keyframes: list[Keyframe], size: int, rng: np.random.Generator
+        self, images: ImagePool, pose: np.ndarray, keyframes: list[Keyframe], size: int, rng: np.random.Generator
     ) -> list[Keyframe]:
         """Up to ``size`` - 2 keyframes that see what the current frame sees (or random ones), and the last keyframe."""
         if not keyframes or size < 2:
@@ -239,9 +237,9 @@ class Mapper:
         *candidates, last = keyframes
         if self.config.selection == "overlap" and candidates:
             fractions = overlap_fractions(
-                images.depth_image(0),
-                pose_from_vector(vector),
-                [pose_from_vector(keyframe.pose) for keyframe in candidates],
+                images.current_depth(),
+                pose,
+                [keyframe.pose for keyframe in candidates],
                 self.camera,
                 rng,
             )
@@ -251,7 +249,7 @@ class Mapper:
 
     def _select(self, images: ImagePool, T_world_camera: np.ndarray, *, everything: bool) -> None:
         """Which vertices of each level may change during this call; and note those that the frame has measured."""
-        depth = wp.array(images.depth_image(0), dtype=float, device=self.device)
+        depth = images.metres()
         for level, optimizer in self._grids.items():
             grid = self.scene.grids[level]
             if level in self._frozen:
@@ -367,6 +365,6 @@ class Mapper:
         wp.copy(self._losses, self._batch.loss, dest_offset=STAGES.index(stage), count=1)
 
 
-def _normalized(vector: np.ndarray) -> np.ndarray:
-    """Pose vector with a unit quaternion: Adam moves its length freely, which changes nothing but the step sizes."""
-    return vector_from_pose(pose_from_vector(vector))
+def _vectors(keyframes: list[Keyframe], pose: np.ndarray) -> np.ndarray:
+    """Pose vectors of keyframes and, last, of the current frame, float64 (frames, 7)."""
+    return np.stack([vector_from_pose(T) for T in (*(keyframe.pose for keyframe in keyframes), pose)])

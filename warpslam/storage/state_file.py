@@ -189,13 +189,14 @@ def _bytes(array: np.ndarray) -> memoryview:
     return array.reshape(-1).data.cast("B") if array.size else memoryview(b"")
 
 
-class _Fields:
+class StateFields:
     """Fields of a state, each checked when it is taken."""
 
     def __init__(self, source: str, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         self.source, self.header, self.arrays = source, header, arrays
 
     def damaged(self, name: str, why: object) -> CheckpointError:
+        """The error that names a field."""
         return CheckpointError(f"{self.source}: field {name} is missing or damaged ({why}): use another copy")
 
     def array(self, name: str, dtype: type, shape: tuple[int | None, ...]) -> np.ndarray:
@@ -212,21 +213,25 @@ class _Fields:
         return array
 
     def mapping(self, name: str) -> dict[str, Any]:
+        """A mapping of the header."""
         value = self.header.get(name)
         if not isinstance(value, dict):
             raise self.damaged(name, f"expected a mapping, found {type(value).__name__}")
         return value
 
     def integer(self, name: str) -> int:
+        """A whole number of the header, from 0 on."""
         value = self.header.get(name)
         if type(value) is not int or value < 0:
             raise self.damaged(name, f"expected a whole number, found {value!r}")
         return value
 
     def frame(self, name: str, count: int) -> int | None:
+        """A frame number below ``count``, or None."""
         return None if self.header.get(name) is None else self._below(name, self.header[name], count)
 
     def frames(self, name: str, count: int) -> list[int]:
+        """A list of frame numbers below ``count``."""
         value = self.header.get(name)
         if not isinstance(value, list):
             raise self.damaged(name, f"expected a list, found {type(value).__name__}")
