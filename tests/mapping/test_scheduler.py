@@ -80,7 +80,7 @@ def gated(frames, monkeypatch):
 def test_waiting_after_every_frame_equals_strict(frames):
     """If each task is taken over before the next frame, nothing may differ from strict: poses, features, decoder."""
     strict, overlapped = new_slam(schedule="schedule=strict"), new_slam()
-    assert isinstance(strict._scheduler, Strict) and isinstance(overlapped._scheduler, Overlapped)
+    assert isinstance(strict.scheduler, Strict) and isinstance(overlapped.scheduler, Overlapped)
     for frame in frames:
         for slam in (strict, overlapped):
             step(slam, frame)
@@ -142,7 +142,7 @@ def test_mapper_and_tracker_leave_each_other_alone(frames, monkeypatch, optimize
     alone.wait()
     step(together, frames[4])
     poses = []
-    while not together._scheduler.has_finished:
+    while not together.scheduler.has_finished:
         poses.append(track(together))
     together.wait()
     assert len(poses) > 1
