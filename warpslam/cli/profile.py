@@ -10,7 +10,7 @@ from warpslam.cli.common import add_command, add_sequence_options, add_slam_opti
 
 if TYPE_CHECKING:
     from warpslam.config import Config
-    from warpslam.profiling.recorder import Profile
+    from warpslam.profiling.session import Profile
     from warpslam.sequences.base import RgbdSequence
 
 _MIN_SHARE = 0.002
