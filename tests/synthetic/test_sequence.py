@@ -14,8 +14,15 @@ from PIL import Image
 from warpslam.camera import Intrinsics
 from warpslam.errors import DatasetError, InputError
 from warpslam.sequences.base import Frame, RgbdSequence
-from warpslam.synthetic import SyntheticSequence, make_room, orbit, room_trajectory, walk, write_replica
-from warpslam.synthetic import __main__ as contact_sheet
+from warpslam.synthetic import (
+    SyntheticSequence,
+    contact_sheet,
+    make_room,
+    orbit,
+    room_trajectory,
+    walk,
+    write_replica,
+)
 
 CAMERA = Intrinsics(50.0, 50.0, 31.5, 23.5, 64, 48)
 

@@ -78,7 +78,7 @@ def iterate(ours: Ours, gradients: Gradients, count: int) -> None:
     batch = RayBatch(pixels, sampling.stratified + sampling.surface, slam.device, launcher)
     batch.set_seeds([0])
     window = wp.zeros(1, dtype=int, device=slam.device)
-    poses = wp.array(vector_from_pose(ours.pose)[None], dtype=float, device=slam.device, requires_grad=True)
+    poses = wp.array(vector_from_pose(ours.poses[5])[None], dtype=float, device=slam.device, requires_grad=True)
     arrays = slam.scene.arrays()
     for _ in range(count):
         with launcher.tape() as tape:

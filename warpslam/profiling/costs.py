@@ -29,18 +29,16 @@ ROW_BYTES = 4 * FEATURE_SIZE
 
 @dataclass(frozen=True)
 class Work:
-    """What one launch does.
-
-    points: Samples (or queried points) it computes; None for kernels that do not work on samples.
-    flop: Floating-point operations, for the decoders only.
-    bytes: Read and written, for kernels that do little else; 0 for the others.
-    counted: Whether skipped points are left out of ``points``; else it is an upper bound.
-    """
+    """What one launch does."""
 
     points: int | None = None
+    """Samples (or queried points) it computes; None for kernels that do not work on samples."""
     flop: float = 0.0
+    """Floating-point operations, for the decoders only."""
     bytes: float = 0.0
+    """Read and written, for kernels that do little else; 0 for the others."""
     counted: bool = True
+    """Whether skipped points are left out of ``points``; else it is an upper bound."""
 
 
 NOTHING = Work()
