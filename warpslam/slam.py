@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -55,6 +55,8 @@ class Slam:
             strict schedule).
         decoders: Decoder weights; by default those of `Config.decoders`, and failing that the package's own.
     """
+
+    has_checkpoints: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -322,6 +324,12 @@ class Slam:
         from warpslam.scene.inventory import memory_report
 
         return memory_report(self)
+
+    def inventory(self) -> dict[str, Any]:
+        """What the map holds, under the names of metrics.json; see `scene.inventory.take_inventory`."""
+        from warpslam.scene.inventory import take_inventory
+
+        return {**take_inventory(self), "memory": self.memory()}
 
     def save(self, path: str | Path) -> None:
         """Write map, keyframes, trajectory and settings to one file (plain arrays, no code)."""

@@ -16,12 +16,12 @@ from warpslam.runtime.cores import slice_count
 from warpslam.scene.image_pool import CompactImage
 from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
-from warpslam.storage.state_file import StateFormat, _Fields, read_state, write_state
+from warpslam.storage.state_file import StateFields, StateFormat, read_state, write_state
 
 if TYPE_CHECKING:
     from warpslam.slam import Slam
 
-MAP_FORMAT = StateFormat("warpslam-map", 4)
+MAP_FORMAT = StateFormat("warpslam-map", 4, "the map of a run with --method nice-slam")
 STATUSES = ("OK", "LOST", "SKIPPED")
 
 
@@ -52,7 +52,7 @@ def saved_config(path: Path) -> Config:
         CheckpointError: the file is missing, damaged, or of another version.
     """
     header, arrays = read_state(path, MAP_FORMAT)
-    return _config(_Fields(str(path), header, arrays))
+    return _config(StateFields(str(path), header, arrays))
 
 
 def slam_state(slam: Slam) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -122,7 +122,7 @@ def slam_from_state(
     """
     from warpslam.slam import Slam
 
-    state = _Fields(source, header, arrays)
+    state = StateFields(source, header, arrays)
     saved = _config(state)
     if config is not None:
         _check_same_map(source, saved, config)
@@ -186,7 +186,7 @@ def slam_from_state(
     return slam
 
 
-def _config(state: _Fields) -> Config:
+def _config(state: StateFields) -> Config:
     try:
         return Config.from_dict(state.mapping("config"))
     except ConfigError as error:
@@ -198,7 +198,7 @@ def _seen_size(camera: Intrinsics) -> tuple[int, int]:
     return strided.height, strided.width
 
 
-def _decoder(state: _Fields, level: str) -> DecoderWeights:
+def _decoder(state: StateFields, level: str) -> DecoderWeights:
     hidden = state.array(f"decoder_{level}:output_linear.weight", np.float32, (None, None)).shape[1]
     if not 1 <= hidden <= 32:
         raise state.damaged(f"decoder_{level}:output_linear.weight", f"{hidden} is no width of a decoder")

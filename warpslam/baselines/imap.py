@@ -12,23 +12,19 @@ not rendered along normals.
 
 from __future__ import annotations
 
-import json
-import os
 import time
-import zipfile
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from warpslam.baselines.base import Baseline
-from warpslam.baselines.imap_network import Bound, ImapBatch, ImapNetwork, Wanted
+from warpslam.baselines.imap_network import Bound, ImapBatch, ImapNetwork, Wanted, imap_shapes
 from warpslam.camera import Intrinsics
 from warpslam.config import Config
-from warpslam.errors import CheckpointError, InputError
+from warpslam.errors import InputError
 from warpslam.field.complexity import flops_per_point, weight_count
 from warpslam.field.rendering import RenderedImage
 from warpslam.field.seeds import ray_seed
@@ -43,11 +39,11 @@ from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
 from warpslam.scene.optimizers import PoseOptimizer, RowOptimizer
+from warpslam.storage.state_file import StateFields, StateFormat
 
 if TYPE_CHECKING:
     import trimesh
 
-FORMAT = "warpslam-imap-1"
 TRACKING_COLOR_WEIGHT = 0.5
 DECAY, DECAY_STEPS = 0.8, 200
 # Samples of a rendered view, which has no depth to guide them.
@@ -60,6 +56,7 @@ class Imap(Baseline):
     """iMAP* under the interface of `warpslam.slam.Slam`. Settings: `ImapConfig` and what that names."""
 
     name = "imap"
+    form = StateFormat("warpslam-imap", 2, "the map of a run with --method imap")
 
     def __init__(
         self, intrinsics: Intrinsics, config: Config | None = None, device: str | None = None, seed: int = 0
@@ -72,7 +69,7 @@ class Imap(Baseline):
             device: Warp device, "cpu" or "cuda:0"; by default CUDA where there is one.
             seed: Of the initial network and of every random choice. Same input, seed and device: same result.
         """
-        super().__init__(intrinsics, config if config is not None else Config(), seed)
+        super().__init__(intrinsics, config, device, seed)
         self.device = wp.get_device(device)
         self.compile_seconds = _compile(self.device)
         self._settings = self.config.imap
@@ -315,15 +312,7 @@ class Imap(Baseline):
             parts.append(wanted(batch).numpy()[: batch.count].copy())
         return np.concatenate(parts) if parts else wanted(batch).numpy()[:0]
 
-    def mesh(self, voxel: float | None = None) -> trimesh.Trimesh:
-        """Coloured mesh of what the mapped frames saw, in the world frame.
-
-        Args:
-            voxel: Edge of a marching-cubes cell [m]; `MeshingConfig.voxel` by default.
-
-        Raises:
-            MeshError: nothing was seen, or there is no surface.
-        """
+    def _mesh(self, voxel: float | None) -> trimesh.Trimesh:
         config = self.config.meshing
         return extract_mesh(
             self,
@@ -365,50 +354,27 @@ class Imap(Baseline):
         np.clip(out.rgb, 0.0, 1.0, out=out.rgb)
         return out
 
-    def save(self, path: str | Path) -> None:
-        """Write network, trajectory and what was seen to one .npz file (no pickled code), for views and meshes."""
-        path = Path(path)
-        header = {"format": FORMAT, "seed": self.seed, "config": self.config.model_dump()}
-        header |= {"intrinsics": vars(self.intrinsics), "status": self._status}
-        arrays: dict[str, Any] = {
-            "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
-            "timestamps": np.array(self._timestamps),
-            "vectors": np.array(self._vectors).reshape(-1, 7),
-            "bounds": np.stack([self._low, self._high]),
-            "seen_frames": np.array([seen.index for seen in self._seen], np.int64),
-            "seen": np.array([seen.millimetres for seen in self._seen], np.uint16),
+    def _state(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        seen = [seen.millimetres for seen in self._seen]
+        camera = self.intrinsics.strided(SEEN_STRIDE)
+        arrays = {
+            # Until something is seen there is no bound.
+            "bounds": np.stack([self._low, self._high])[: 2 * bool(seen)],
+            "seen": np.array(seen, np.uint16).reshape(-1, camera.height, camera.width),
         }
         arrays |= {f"network:{name}": array for name, array in self.network.tensors().items()}
-        temporary = path.with_name(path.name + ".part")
-        with open(temporary, "wb") as file:
-            np.savez(file, **arrays)
-        os.replace(temporary, path)
+        return {"seen": [seen.index for seen in self._seen]}, arrays
 
-    @classmethod
-    def load(cls, path: str | Path, device: str | None = None) -> Imap:
-        """Read what `save` wrote, for views and meshes; images of keyframes are not in it.
-
-        Raises:
-            CheckpointError: the file is missing, damaged, or no network of iMAP*.
-        """
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-            header = json.loads(arrays["header"].tobytes())
-            if header["format"] != FORMAT:
-                raise CheckpointError(f"{path}: is no map of iMAP* of this version; run again with --method imap")
-            config = Config.model_validate(header["config"])
-            result = cls(Intrinsics(**header["intrinsics"]), config, device, header["seed"])
-            tensors = {name.split(":", 1)[1]: a for name, a in arrays.items() if name.startswith("network:")}
-            result.network = ImapNetwork(tensors, result._launcher)
-            result._timestamps = [float(t) for t in arrays["timestamps"]]
-            result._vectors, result._status = list(arrays["vectors"]), header["status"]
-            result._low, result._high = arrays["bounds"]
-            pairs = zip(arrays["seen_frames"], arrays["seen"], strict=True)
-            result._seen = [SeenDepth(int(index), millimetres) for index, millimetres in pairs]
-        except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise CheckpointError(f"{path}: can't be read as a map of iMAP* ({error}); use another copy") from error
-        return result
+    def _restore(self, state: StateFields) -> None:
+        camera = self.intrinsics.strided(SEEN_STRIDE)
+        frames = state.frames("seen", len(self._vectors))
+        depths = state.array("seen", np.uint16, (len(frames), camera.height, camera.width))
+        self._seen = [SeenDepth(index, millimetres) for index, millimetres in zip(frames, depths, strict=True)]
+        if frames:
+            self._low, self._high = state.array("bounds", np.float64, (2, 3)).copy()
+        shapes = imap_shapes().items()
+        tensors = {name: state.array(f"network:{name}", np.float32, shape) for name, shape in shapes}
+        self.network = ImapNetwork(tensors, self._launcher)
 
 
 def _compile(device: wp.Device) -> float:

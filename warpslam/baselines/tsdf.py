@@ -6,31 +6,28 @@ holds a truncated distance (float32), a weight and a colour (uint16 each, three 
 
 from __future__ import annotations
 
-import os
 import time
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import trimesh
 
 from warpslam.baselines.base import Baseline
 from warpslam.camera import Intrinsics
 from warpslam.config import Config
-from warpslam.errors import CheckpointError, InputError, MeshError, MissingDependencyError
+from warpslam.errors import InputError, MeshError, MissingDependencyError
 from warpslam.field.rendering import RenderedImage
 from warpslam.frames import FrameResult
 from warpslam.poses import check_transform, vector_from_pose
+from warpslam.storage.state_file import StateFields, StateFormat
 
-if TYPE_CHECKING:
-    import trimesh
-
-FORMAT = "warpslam-tsdf-1"
 BLOCK_VOXELS = 16
 BYTES_PER_VOXEL = 12
+_ATTRIBUTES = {"tsdf": (np.float32, 1), "weight": (np.uint16, 1), "color": (np.uint16, 3)}
+"""Type and channels of what a voxel holds."""
 _FIRST_CAPACITY = 2000  # blocks; Open3D allocates more as they are needed
 
 
@@ -57,6 +54,7 @@ class Tsdf(Baseline):
     """
 
     name = "tsdf"
+    form = StateFormat("warpslam-tsdf", 2, "the map of a run with --method tsdf")
 
     def __init__(
         self, intrinsics: Intrinsics, config: Config | None = None, device: str | None = None, seed: int = 0
@@ -69,7 +67,7 @@ class Tsdf(Baseline):
             device: "cpu" or "cuda:0"; by default the CPU, as the package's wheels come without CUDA.
             seed: Not used: fusion has no random choice.
         """
-        super().__init__(intrinsics, config if config is not None else Config(), seed)
+        super().__init__(intrinsics, config, device, seed)
         self._o3d = import_open3d()
         self.device = device or "cpu"
         core = self._o3d.core
@@ -120,18 +118,8 @@ class Tsdf(Baseline):
     def flops_per_point(self) -> None:
         """None: the map is looked up."""
 
-    def mesh(self, voxel: float | None = None) -> trimesh.Trimesh:
-        """Coloured zero crossing of the distance, in the world frame.
-
-        Args:
-            voxel: Must be that of the volume, or None: the mesh has no other resolution.
-
-        Raises:
-            MeshError: there is no surface.
-            InputError: another voxel is asked for.
-        """
-        import trimesh
-
+    def _mesh(self, voxel: float | None) -> trimesh.Trimesh:
+        """Zero crossing of the distance; the mesh has no other resolution than the volume."""
         if voxel is not None and voxel != self.config.tsdf.voxel:
             raise InputError(f"voxel = {voxel}: the volume has {self.config.tsdf.voxel} m; run with --set tsdf.voxel")
         vertices, faces, colors = self._surface
@@ -191,49 +179,20 @@ class Tsdf(Baseline):
         scene.add_triangles(core.Tensor(vertices), core.Tensor(faces.astype(np.uint32)))
         return scene
 
-    def save(self, path: str | Path) -> None:
-        """Write the volume and the trajectory to one .npz file (no pickled code)."""
-        path = Path(path)
+    def _state(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         keys, rows = self._active()
-        arrays = {name: self._grid.attribute(name)[rows].cpu().numpy() for name in ("tsdf", "weight", "color")}
-        temporary = path.with_name(path.name + ".part")
-        with open(temporary, "wb") as file:
-            np.savez_compressed(
-                file,
-                format=np.array(FORMAT),
-                config=np.array(self.config.model_dump_json()),
-                intrinsics=np.array(list(vars(self.intrinsics).values())),
-                keys=keys.cpu().numpy(),
-                timestamps=np.array(self._timestamps),
-                vectors=np.array(self._vectors).reshape(-1, 7),
-                status=np.array(self._status, dtype=str),
-                **arrays,
-            )
-        os.replace(temporary, path)
+        arrays = {name: self._grid.attribute(name)[rows].cpu().numpy() for name in _ATTRIBUTES}
+        return {}, {"keys": keys.cpu().numpy(), **arrays}
 
-    @classmethod
-    def load(cls, path: str | Path, device: str | None = None) -> Tsdf:
-        """Read what `save` wrote; the result goes on from the last frame.
-
-        Raises:
-            CheckpointError: the file is missing, damaged, or no TSDF volume.
-        """
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-            if str(arrays.get("format")) != FORMAT:
-                raise CheckpointError(f"{path}: is no TSDF volume of this version; run again with --method tsdf")
-            fx, fy, cx, cy, width, height = arrays["intrinsics"].tolist()
-            config = Config.model_validate_json(str(arrays["config"]))
-            tsdf = cls(Intrinsics(fx, fy, cx, cy, int(width), int(height)), config, device)
-            tsdf._timestamps = [float(t) for t in arrays["timestamps"]]
-            tsdf._vectors, tsdf._status = list(arrays["vectors"]), [str(s) for s in arrays["status"]]
-            if len(arrays["keys"]):
-                values = [tsdf._tensor(arrays[name]) for name in ("tsdf", "weight", "color")]
-                tsdf._grid.hashmap().insert(tsdf._tensor(arrays["keys"]), values)
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise CheckpointError(f"{path}: can't be read as a TSDF volume ({error}); use another copy") from error
-        return tsdf
+    def _restore(self, state: StateFields) -> None:
+        keys = state.array("keys", np.int32, (None, 3))
+        edge = BLOCK_VOXELS
+        values = [
+            state.array(name, dtype, (len(keys), edge, edge, edge, channels))
+            for name, (dtype, channels) in _ATTRIBUTES.items()
+        ]
+        if len(keys):
+            self._grid.hashmap().insert(self._tensor(keys), [self._tensor(array) for array in values])
 
     def _active(self) -> tuple[Any, Any]:
         """Coordinates of the allocated blocks, and their rows in the attributes."""
