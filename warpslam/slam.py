@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import warp as wp
@@ -61,6 +61,8 @@ class Slam:
             on the CPU (with the strict schedule).
         decoders: Decoder weights; by default those of `Config.decoders`, and failing that the package's own.
     """
+
+    has_checkpoints: ClassVar[bool] = True
 
     def __init__(
         self,

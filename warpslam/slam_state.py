@@ -15,7 +15,7 @@ from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.errors import ConfigError, InputError
 from warpslam.field.decoders import LEVELS, Decoders, DecoderWeights, expected_shapes
-from warpslam.frames import FrameStatus, check_settings
+from warpslam.frames import check_settings
 from warpslam.runtime.cores import slice_count
 from warpslam.scene.feature_grid import GridState
 from warpslam.scene.image_pool import CompactImage
@@ -25,7 +25,7 @@ from warpslam.scene.scene_map import SceneState
 from warpslam.storage.state_file import StateFields, StateFormat, read_state, write_state
 from warpslam.trajectory import HistoryState
 
-MAP_FORMAT = StateFormat("warpslam-map", 5)
+MAP_FORMAT = StateFormat("warpslam-map", 5, "the map of a run with --method nice-slam")
 
 
 @dataclass(frozen=True)
@@ -108,11 +108,7 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
     keyframe_poses = [keyframe.pose for keyframe, _ in state.keyframes]
     seen = [one.millimetres for one in state.seen]
     arrays: dict[str, np.ndarray] = {
-        "timestamps": state.history.timestamps,
-        "poses": state.history.poses,
-        "status": state.history.status,
-        "depth_errors": state.history.depth_errors,
-        "motion": state.history.motion,
+        **state.history.arrays(),
         "bounds": np.stack([state.scene.low, state.scene.high]),
         "keyframe_poses": np.array(keyframe_poses, np.float64).reshape(-1, 4, 4),
         "seen": np.array(seen, np.uint16).reshape(-1, *_seen_size(state.intrinsics)),
@@ -159,7 +155,7 @@ def state_from_arrays(
         check_settings(camera, config)
     except (TypeError, ConfigError, InputError) as error:
         raise fields.damaged("intrinsics", error) from None
-    history = _history(fields)
+    history = HistoryState.read(fields)
     count = len(history.poses)
     size = (camera.height, camera.width)
     frames = fields.frames("keyframes", count)
@@ -192,22 +188,6 @@ def _config(fields: StateFields) -> Config:
         return Config.from_dict(fields.mapping("config"))
     except ConfigError as error:
         raise fields.damaged("config", error) from None
-
-
-def _history(fields: StateFields) -> HistoryState:
-    poses = fields.array("poses", np.float64, (None, 4, 4))
-    count = len(poses)
-    status = fields.array("status", np.uint8, (count,))
-    if (status >= len(FrameStatus)).any():
-        raise fields.damaged("status", f"codes beyond {len(FrameStatus) - 1}")
-    return HistoryState(
-        timestamps=fields.array("timestamps", np.float64, (count,)),
-        poses=poses,
-        status=status,
-        depth_errors=fields.array("depth_errors", np.float64, (count,)),
-        motion=fields.array("motion", np.float64, (4, 4)),
-        first=fields.integer("first"),
-    )
 
 
 def _grid(fields: StateFields, level: str) -> GridState:

@@ -13,6 +13,7 @@ import numpy as np
 
 from warpslam.frames import FrameStatus
 from warpslam.poses import motion_between
+from warpslam.storage.state_file import StateFields
 
 RECENT_FRAMES = 20
 STEP_FACTOR = 5.0  # a step beyond this multiple of the recent ones is a jump
@@ -73,6 +74,31 @@ class HistoryState:
     """float64 (4, 4)."""
     first: int
     """Frame from which the camera has moved without a break."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All but ``first``, by name."""
+        return {name: value for name, value in vars(self).items() if name != "first"}
+
+    @classmethod
+    def read(cls, fields: StateFields) -> HistoryState:
+        """From a saved state whose arrays are `arrays`, and whose header has ``first``.
+
+        Raises:
+            CheckpointError: A field is missing or damaged.
+        """
+        poses = fields.array("poses", np.float64, (None, 4, 4))
+        count = len(poses)
+        status = fields.array("status", np.uint8, (count,))
+        if (status >= len(FrameStatus)).any():
+            raise fields.damaged("status", f"codes beyond {len(FrameStatus) - 1}")
+        return cls(
+            timestamps=fields.array("timestamps", np.float64, (count,)),
+            poses=poses,
+            status=status,
+            depth_errors=fields.array("depth_errors", np.float64, (count,)),
+            motion=fields.array("motion", np.float64, (4, 4)),
+            first=fields.integer("first"),
+        )
 
 
 class FrameHistory:

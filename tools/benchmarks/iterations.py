@@ -56,6 +56,7 @@ class Ours:
         last = self.frames[5]
         self.slam.scene.cover(*measured_extent(last.depth, self.poses[5], self.slam.intrinsics))
         self.slam.images.set(0, last.rgb, last.depth)
+        self.vector = vector_from_pose(self.poses[5])
 
     def map_call(self, iterations: int, stage: str | None = None, *, whole: bool = False) -> None:
         """A mapping call; with a stage, all iterations are of that stage (but for the first)."""
@@ -144,8 +145,8 @@ def phases_of(ours: Ours, count: int = 10) -> dict[str, Phase]:
         for _ in range(count):
             alone.track_once(200)
 
-    ours.slam._tracker.config.pixels = 200
-    ours.slam._tracker._batch = ours.slam._tracker._new_batch(200)
+    ours.slam.tracker.config.pixels = 200
+    ours.slam.tracker._batch = ours.slam.tracker._new_batch(200)
     phases = {
         "tracking, Adam": Phase(lambda: ours.track("adam", count), torch_tracking, count),
         "tracking, Gauss-Newton": Phase(lambda: ours.track("gauss_newton", count), torch_tracking, count),
@@ -187,14 +188,8 @@ def launching_share(ours: Ours, optimizer: Literal["adam", "gauss_newton"], repe
     def run() -> None:
         ours.track(optimizer, 100)
 
-<<<<<<< HEAD
     ours.slam.tracker._launcher.forget()
-    Launcher.command = command
-    try:
-=======
-    ours.slam._tracker._launcher.forget()
     with mock.patch.object(Launcher, "command", command):
->>>>>>> tools
         run()  # records the launches
     whole = [recorded.bounds for recorded in commands]
 
@@ -234,45 +229,8 @@ def main(arguments: list[str] | None = None) -> int:
     torch.manual_seed(0)
     sequence = SyntheticSequence(1_000_000, 40, intrinsics=CAMERA)
     ours = Ours(sequence, options.set)
-<<<<<<< HEAD
-    theirs, masks, alone = torch_twin(ours)
-    n = 10
-
-    def torch_mapping(stage: str, count: int) -> Callable:
-        def run() -> None:
-            theirs.start_mapping(masks)
-            for _ in range(count):
-                theirs.map_once(stage, 1000)
-
-        return run
-
-    def torch_call(problem: TorchSlam, count: int, factor: float, *, adjust: bool) -> Callable:
-        def run() -> None:
-            problem.start_mapping(masks, adjust=adjust)
-            for j in range(count):
-                stage = "middle" if j <= 0.4 * count else "fine" if j <= 0.6 * count else "color"
-                problem.map_once(stage, 1000, factor=factor)
-
-        return run
-
-    def torch_tracking() -> None:
-        alone.start_tracking()
-        for _ in range(n):
-            alone.track_once(200)
-
-    ours.slam.tracker.config.pixels = 200
-    ours.slam.tracker._batch = ours.slam.tracker._new_batch(200)
-    pairs = {"tracking, Adam": (lambda: ours.track("adam", n), torch_tracking)}
-    pairs["tracking, Gauss-Newton"] = (lambda: ours.track("gauss_newton", n), torch_tracking)
-    for stage in STAGES:
-        pairs[f"mapping, {stage}"] = (lambda stage=stage: ours.map_call(n, stage), torch_mapping(stage, n))
-    pairs["mapping call"] = (lambda: ours.map_call(60, whole=True), torch_call(theirs, 60, 1.0, adjust=True))
-    pairs["first frame, 60 iterations"] = (lambda: ours.map_first(60), torch_call(alone, 60, 5.0, adjust=False))
-    divide = {name: n if name.startswith(("tracking", "mapping, ")) else 1 for name in pairs}
-=======
     phases = phases_of(ours)
     pairs = {name: (phase.ours, phase.theirs) for name, phase in phases.items()}
->>>>>>> tools
     times = alternate(pairs, options.repeats)
     peak = matrix_peak()
     shares = {

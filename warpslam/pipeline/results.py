@@ -137,11 +137,9 @@ class RunResults:
         self.metrics["map"] = {"bytes": self.slam.map_bytes, "flops_per_point": self.slam.flops_per_point}
 
     def _describe_map(self) -> None:
-        from warpslam.slam import Slam
-
-        if isinstance(self.slam, Slam):
-            with self._clock("inventory"):
-                self.metrics.update(self.slam.inventory())
+        assert self.slam is not None
+        with self._clock("inventory"):
+            self.metrics.update(self.slam.inventory())
 
     def _write_mesh(self) -> None:
         assert self.slam is not None

@@ -67,4 +67,5 @@ class RunProgress:
 
 
 def result_row(result: FrameResult) -> dict[str, Any]:
+    """A result without its pose, as JSON takes it."""
     return {f.name: getattr(result, f.name) for f in dataclasses.fields(result) if f.name != "T_world_camera"}
