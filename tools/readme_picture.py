@@ -1,6 +1,6 @@
 """The strip on the first screen of README.md: a frame of a run, what the map renders at its pose, and the mesh from above.
 
-    python tools/readme_picture.py runs/house house --frame 120 --eye 3.4,-1.9,4.6 --target 6.6,1.1,0.6 --out strip.jpg
+    python -m tools.readme_picture runs/house house --frame 40 --eye 4.4,-3.1,3.7 --target 6.7,1.5,0.75 --out strip.jpg
 
 The mesh is seen from ``--eye`` towards ``--target``, in the sequence's world, whose z is up. Faces that turn away from
 there are left out, so that a room is looked into from outside.
@@ -23,7 +23,7 @@ from warpslam.synthetic import MeshRenderer, load_mesh, look_at
 HEIGHT = 360  # [px] of the strip
 GAP = 8  # [px] between its pictures
 SUPERSAMPLING = 3
-FIELD_OF_VIEW = 55.0  # [deg] of the view of the mesh, across
+FIELD_OF_VIEW = 50.0  # [deg] of the view of the mesh, across
 BACKGROUND = 255
 
 
