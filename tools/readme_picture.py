@@ -1,4 +1,4 @@
-"""The strip on the first screen of README.md: a frame of a run, what the map renders at its pose, and the mesh from above.
+"""The strip on the first screen of README.md: a frame of a run, the map rendered at its pose, and the mesh from above.
 
     python -m tools.readme_picture runs/house house --frame 40 --eye 4.4,-3.1,3.7 --target 6.7,1.5,0.75 --out strip.jpg
 
