@@ -311,7 +311,7 @@ class Slam:
         """View of the map from a pose, every ``stride``-th pixel; a ``depth`` image [m] guides the samples if given.
 
         Raises:
-            InputError: the map is empty, or the pose is no rigid transform.
+            InputError: The map is empty, or the pose is no rigid transform.
         """
         if self.scene.is_empty:
             raise InputError("the map is empty: step at least one frame first")
@@ -327,7 +327,7 @@ class Slam:
             forecast: Add what the coarse level suggests where nothing was seen, in cyan.
 
         Raises:
-            MeshError: nothing was seen, or there is no surface.
+            MeshError: Nothing was seen, or there is no surface.
         """
         self.wait()
         config = self.config.meshing

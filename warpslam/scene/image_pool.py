@@ -75,7 +75,7 @@ class ImagePool:
         """Slots of some images, which are on the device until the next call.
 
         Raises:
-            MapSizeError: they do not fit into the memory set for them.
+            MapSizeError: They do not fit into the memory set for them.
         """
         wanted = list(dict.fromkeys(images))
         if 1 + len(wanted) > self.max_slots:

@@ -103,7 +103,7 @@ class SceneMap:
         """Grow the map to hold the box ``low``..``high`` [m] plus the margin; True if it grew.
 
         Raises:
-            MapSizeError: the grown map would not fit `GridConfig.max_gigabytes`, or what is free.
+            MapSizeError: The grown map would not fit `GridConfig.max_gigabytes`, or what is free.
         """
         spacing, margin = self.config.middle_spacing, self.config.margin
         if not self.is_empty and (low > self.low).all() and (high < self.high).all():
