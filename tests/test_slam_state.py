@@ -187,13 +187,15 @@ def test_memory_report_adds_up(frames):
     """Bytes by part, and the observed volume: that of the cone before a wall."""
     slam = Slam(CAMERA, Config.from_preset("default", SETTINGS), "cpu", decoders=load_decoders())
     slam.step(frames[0].rgb, np.full((36, 48), 3.0, np.float32))
-    report = slam.memory()
+    inventory = slam.inventory()
+    report, observed = inventory["memory"], inventory["observed_volume_m3"]
     assert report["grid_bytes"] == sum(grid.features.capacity for grid in slam.scene.grids.values())
     parts = report["grid_bytes"] + report["keyframe_bytes"] + report["seen_bytes"]
     assert report["state_bytes"] == parts and report["seen_bytes"] == 2 * 9 * 12
     cone = 3.0**3 / 3 * (48 / 40) * (36 / 40)
-    assert report["observed_m3"] == pytest.approx(cone, rel=0.2)
-    assert report["state_bytes_per_observed_m3"] == pytest.approx(parts / report["observed_m3"])
+    # Cells at the border count whole.
+    assert cone < observed < 1.6 * cone
+    assert report["state_bytes_per_observed_m3"] == pytest.approx(parts / observed)
 
 
 @pytest.mark.slow
@@ -215,7 +217,7 @@ def test_memory_stays_flat_over_a_thousand_frames():
         slam.step(frame.rgb, frame.depth, T_world_camera=frame.T_world_camera)
         slam.tracker.track(slam.scene.arrays(), slam.images, n, frame.T_world_camera)
         if n % 200 == 199:
-            used.append((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, slam.memory()["grid_bytes"]))
+            used.append((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, slam.inventory()["memory"]["grid_bytes"]))
     process, grids = zip(*used, strict=True)
     assert process[-1] - process[0] < 20 * 1024, f"the process grew: {process} KiB"
     assert grids[-1] == grids[0]
