@@ -68,7 +68,7 @@ class Slam:
         decoders: Decoders | None = None,
     ) -> None:
         self.intrinsics = intrinsics
-        self.config = config if config is not None else Config()
+        self.config = (config if config is not None else Config()).resolved()
         _check_settings(intrinsics, self.config)
         check_window_fits(intrinsics, self.config.keyframes.max_gigabytes, self.config.mapping.window)
         self.device = wp.get_device(device)
@@ -81,12 +81,7 @@ class Slam:
         self._images = ImagePool(intrinsics, self.device, self.config.keyframes.max_gigabytes)
         self._tracker = Tracker(intrinsics, self.config.tracking, self.config.sampling, self.device, seed)
         self._localizer = Localizer(self._tracker, self.config.tracking, intrinsics)
-        mapping = self.config.mapping
-        if self.config.tracking.use_given_poses:
-            # What is given stays as it is, and can be believed.
-            depth_start = mapping.depth_start is not False
-            mapping = mapping.model_copy(update={"bundle_adjustment": False, "depth_start": depth_start})
-        self._mapper = Mapper(self.scene, intrinsics, mapping, self.config.sampling, self.device, seed)
+        self._mapper = Mapper(self.scene, intrinsics, self.config.mapping, self.config.sampling, self.device, seed)
         self._scheduler = new_scheduler(self.config.schedule, self._mapper, self._images)
         self._vectors: list[np.ndarray] = []
         self._timestamps: list[float] = []
