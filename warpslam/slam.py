@@ -74,7 +74,7 @@ class Slam:
         decoders: Decoders | None = None,
     ) -> None:
         self.intrinsics = intrinsics
-        self.config = config if config is not None else Config()
+        self.config = (config if config is not None else Config()).resolved()
         check_settings(intrinsics, self.config)
         check_window_fits(intrinsics, self.config.keyframes.max_gigabytes, self.config.mapping.window)
         self.device = wp.get_device(device)
@@ -88,12 +88,7 @@ class Slam:
         self.images = ImagePool(intrinsics, self.device, self.config.keyframes.max_gigabytes)
         self.tracker = Tracker(intrinsics, self.config.tracking, self.config.sampling, self.device, seed)
         self.localizer = Localizer(self.tracker, self.config.tracking, intrinsics)
-        mapping = self.config.mapping
-        if self.config.tracking.use_given_poses:
-            # What is given stays as it is, and can be believed.
-            depth_start = mapping.depth_start is not False
-            mapping = mapping.model_copy(update={"bundle_adjustment": False, "depth_start": depth_start})
-        self.mapper = Mapper(self.scene, intrinsics, mapping, self.config.sampling, self.device, seed)
+        self.mapper = Mapper(self.scene, intrinsics, self.config.mapping, self.config.sampling, self.device, seed)
         self.scheduler = new_scheduler(self.config.schedule, self.mapper, self.images)
         self._seen: list[SeenDepth] = []
         self._current: int | None = None

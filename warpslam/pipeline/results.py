@@ -87,7 +87,7 @@ class RunResults:
     metrics: dict[str, Any] = field(default_factory=dict)
 
     def _write_input(self) -> None:
-        self.config.save(self.folder.config)
+        self.config.resolved().save(self.folder.config)
         if self.source is not None:
             self.folder.write_source(self.source)
         log.info("%s: %d of %d frames, %s", self.sequence.name, len(self.selected), len(self.sequence), self.selected)
