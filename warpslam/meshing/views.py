@@ -42,16 +42,16 @@ _CLOUD_SIZE = 200_000
 class ObservedView:
     """A depth image and where it was taken: the evidence for what has been seen.
 
-    depth: z-depth [m], float32, shape (H, W). Zero, negative and non-finite pixels count as missing.
-    intrinsics: Camera of exactly this image (`Intrinsics.scaled` for a downsampled one).
-    T_world_camera: Camera-to-world transform, shape (4, 4), OpenCV axes.
-
-    Raises `InputError` where the depth is no image of the camera's size or the transform is not rigid.
+    Raises:
+        InputError: The depth is no image of the camera's size, or the transform is not rigid.
     """
 
     depth: np.ndarray
+    """z-depth [m], float32, shape (H, W). Zero, negative and non-finite pixels count as missing."""
     intrinsics: Intrinsics
+    """Camera of exactly this image (`Intrinsics.scaled` for a downsampled one)."""
     T_world_camera: np.ndarray
+    """Camera-to-world transform, shape (4, 4), OpenCV axes."""
 
     def __post_init__(self) -> None:
         depth = np.asarray(self.depth, dtype=np.float32)
