@@ -59,7 +59,7 @@ def test_localize_in_a_map(capsys):
 
 def test_runs_as_a_module(tmp_path):
     """As the page says: python -m, with a number of frames and settings; the mesh lies in the working directory."""
-    command = [sys.executable, "-m", "warpslam.examples.first_steps", "3", *SMALL[4:]]
+    command = [sys.executable, "-m", "warpslam.examples.first_steps", "3", *SMALL[len(first_steps.SETTINGS) :]]
     path = os.pathsep.join([str(Path(warpslam.__file__).parent.parent), os.environ.get("PYTHONPATH", "")])
     environment = {**os.environ, "PYTHONPATH": path}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)

@@ -21,7 +21,7 @@ def frames_of_my_camera(count: int) -> Iterator[tuple[np.ndarray, np.ndarray, fl
         yield light * frame.rgb, (1000 * light * frame.depth).astype(np.uint16), frame.timestamp
 
 
-def main(frame_count: int = 30, *, settings: Sequence[str] = SETTINGS) -> warpslam.Slam:
+def main(frame_count: int = 20, *, settings: Sequence[str] = SETTINGS) -> warpslam.Slam:
     """Track and map; a frame that is no use is told, and changes nothing."""
     slam = warpslam.Slam(CAMERA, warpslam.Config.from_preset("default", list(settings)))
     statuses: Counter[str] = Counter()
