@@ -226,7 +226,7 @@ def test_counted_points_are_those_computed(frames, min_transmittance, monkeypatc
     """The points counted beforehand are the ones whose outputs a kernel then writes."""
     slam = new_slam("mapping.first_iterations=60", "mapping.coarse=false")
     steps(slam, frames[:1])
-    batch, arrays = slam._mapper._batch, slam.scene.arrays()
+    batch, arrays = slam.mapper._batch, slam.scene.arrays()
     thresholds = Thresholds(min_weight=0.02, min_transmittance=min_transmittance)
     for bits in {id(array): array for array in batch.bits.values()}.values():
         bits.fill_(0xFFFFFFFF)

@@ -55,30 +55,30 @@ class Ours:
             self.slam.step(frame.rgb, frame.depth, T_world_camera=frame.T_world_camera)
         last = self.frames[5]
         self.slam.scene.cover(*measured_extent(last.depth, self.poses[5], self.slam.intrinsics))
-        self.slam._images.set(0, last.rgb, last.depth)
+        self.slam.images.set(0, last.rgb, last.depth)
         self.vector = vector_from_pose(self.poses[5])
 
     def map_call(self, iterations: int, stage: str | None = None, *, whole: bool = False) -> None:
         """A mapping call; with a stage, all iterations are of that stage (but for the first)."""
-        config = self.slam._mapper.config
+        config = self.slam.mapper.config
         config.iterations = iterations
         config.middle_share, config.fine_share = STAGES[stage] if stage else (0.4, 0.6)
         config.coarse, config.bundle_adjustment = whole, whole
         keyframes = self.slam.keyframes
-        self.slam._mapper.map_frame(self.slam._images, 5, self.vector, keyframes)
+        self.slam.mapper.map_frame(self.slam.images, 5, self.poses[5], keyframes)
 
     def map_first(self, iterations: int) -> None:
         """Iterations of the first frame, at its rates."""
-        config = self.slam._mapper.config
+        config = self.slam.mapper.config
         config.first_iterations, config.coarse = iterations, False
         config.middle_share, config.fine_share = 0.4, 0.6
-        self.slam._mapper.map_first(self.slam._images, 5, self.vector)
+        self.slam.mapper.map_first(self.slam.images, 5, self.poses[5])
 
     def track(self, optimizer: Literal["adam", "gauss_newton"], iterations: int) -> None:
         """Tracking with a number of iterations, 200 rays."""
-        config = self.slam._tracker.config
+        config = self.slam.tracker.config
         config.optimizer, config.iterations, config.keep_best = optimizer, iterations, "last"
-        self.slam._tracker.track(self.slam.scene.arrays(), self.slam._images, 5, self.poses[5])
+        self.slam.tracker.track(self.slam.scene.arrays(), self.slam.images, 5, self.poses[5])
 
 
 def torch_twin(ours: Ours) -> tuple[TorchSlam, dict[str, np.ndarray], TorchSlam]:
@@ -96,7 +96,7 @@ def torch_twin(ours: Ours) -> tuple[TorchSlam, dict[str, np.ndarray], TorchSlam]
     masks = {}
     for level in levels:
         mask = np.zeros(scene.grids[level].row_count, bool)
-        mask[ours.slam._mapper._grids[level].rows.numpy()] = True
+        mask[ours.slam.mapper._grids[level].rows.numpy()] = True
         masks[level] = mask
     decoders = {weights.level: weights for weights in scene.decoder_weights}
     chosen = (5, 1, 2, 3, 4)
@@ -145,8 +145,8 @@ def phases_of(ours: Ours, count: int = 10) -> dict[str, Phase]:
         for _ in range(count):
             alone.track_once(200)
 
-    ours.slam._tracker.config.pixels = 200
-    ours.slam._tracker._batch = ours.slam._tracker._new_batch(200)
+    ours.slam.tracker.config.pixels = 200
+    ours.slam.tracker._batch = ours.slam.tracker._new_batch(200)
     phases = {
         "tracking, Adam": Phase(lambda: ours.track("adam", count), torch_tracking, count),
         "tracking, Gauss-Newton": Phase(lambda: ours.track("gauss_newton", count), torch_tracking, count),
@@ -188,7 +188,7 @@ def launching_share(ours: Ours, optimizer: Literal["adam", "gauss_newton"], repe
     def run() -> None:
         ours.track(optimizer, 100)
 
-    ours.slam._tracker._launcher.forget()
+    ours.slam.tracker._launcher.forget()
     with mock.patch.object(Launcher, "command", command):
         run()  # records the launches
     whole = [recorded.bounds for recorded in commands]

@@ -471,7 +471,7 @@ def kernels(device: str, repeats: int = 10) -> Figures:
     if SMALL:
         settings += ["tracking.ignore_edge_u=5", "tracking.ignore_edge_v=5"]
     engine = _slam_over(camera, frames, "replica", settings, device)
-    tracker, mapper = engine._tracker, engine._mapper
+    tracker, mapper = engine.tracker, engine.mapper
     result: Figures = {}
     for name, part, kind in (
         ("tracking iteration", tracker, "optimize"),
@@ -501,12 +501,11 @@ def kernels(device: str, repeats: int = 10) -> Figures:
 
 def engine_calls(engine: Any, index: int, frame: Any) -> dict[str, tuple[Callable[[], object], int]]:
     """Calls of the engine's parts on its last frame, and how often to time each."""
-    from warpslam.poses import vector_from_pose
 
-    images, vector = engine._images, vector_from_pose(engine.trajectory.poses[index])
+    images, pose = engine.images, engine.history.pose(index)
     return {
-        "mapping call ms": (lambda: engine._mapper.map_frame(images, index, vector, engine.keyframes), 3),
-        "track ms": (lambda: engine._tracker.track(engine.scene.arrays(), images, index, frame.T_world_camera), 10),
+        "mapping call ms": (lambda: engine.mapper.map_frame(images, index, pose, engine.keyframes), 3),
+        "track ms": (lambda: engine.tracker.track(engine.scene.arrays(), images, index, frame.T_world_camera), 10),
         "set image ms": (lambda: images.set(0, frame.rgb, frame.depth), 10),
         "keyframe image ms": (lambda: images.add(frame.rgb, frame.depth), 3),
     }

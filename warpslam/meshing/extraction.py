@@ -25,8 +25,9 @@ import trimesh
 from warpslam.errors import InputError, MeshError
 from warpslam.meshing.cleaning import Hull, face_vectors, keep_faces, piece_areas, vertex_normals
 from warpslam.meshing.marching_cubes import Surface, all_corners, touched_points
-from warpslam.meshing.views import Evidence, ObservedView
+from warpslam.meshing.views import Evidence
 from warpslam.runtime.phases import phase
+from warpslam.scene.mapped_views import ObservedView
 
 UNOBSERVED_LOGIT = -100.0
 # What an observed point farther than the band from every surface holds: free, without asking the field.

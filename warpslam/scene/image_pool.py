@@ -11,6 +11,7 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.errors import MapSizeError
+from warpslam.kernels import images as image_kernels
 
 
 class ImagePool:
@@ -33,6 +34,10 @@ class ImagePool:
         self.images: list[CompactImage] = []
         self._slot_of: dict[int, int] = {}  # by image, the one used longest ago first
         self._allocate(max(min(capacity, self.max_slots), 1))
+        size = (camera.height, camera.width)
+        self._metres = wp.zeros(size, dtype=float, device=device)
+        # What slot 0 holds, so that nothing that is here already comes back from the device.
+        self._current = np.zeros((*size, 3), np.uint8), np.zeros(size, np.uint16), 0.0
 
     def _allocate(self, capacity: int) -> None:
         shape = (capacity, self.camera.height, self.camera.width)
@@ -55,6 +60,7 @@ class ImagePool:
         """Put into slot 0 what the other pool holds there."""
         for target, source in zip(self.arrays, other.arrays, strict=True):
             wp.copy(target, source, count=source.size // source.shape[0])
+        self._current = other._current
 
     def set(self, slot: int, rgb: np.ndarray, depth: np.ndarray) -> None:
         """Store an image: uint8 (H, W, 3) and float32 (H, W) [m]."""
@@ -69,7 +75,7 @@ class ImagePool:
         """Slots of some images, which are on the device until the next call.
 
         Raises:
-            MapSizeError: they do not fit into the memory set for them.
+            MapSizeError: They do not fit into the memory set for them.
         """
         wanted = list(dict.fromkeys(images))
         if 1 + len(wanted) > self.max_slots:
@@ -96,14 +102,24 @@ class ImagePool:
         self.rgb[slot].assign(np.ascontiguousarray(rgb))
         self.depth[slot].assign(depth)
         self.scale[slot : slot + 1].assign(np.array([scale], np.float32))
+        if slot == 0:
+            # The caller's array may be filled with the next frame.
+            self._current = rgb.copy(), depth, float(np.float32(scale))
 
-    def depth_image(self, slot: int) -> np.ndarray:
-        """Depth [m], float32 (H, W)."""
-        return self.depth[slot].numpy().astype(np.float32) * self.scale.numpy()[slot]
+    def metres(self) -> wp.array:
+        """Depth of slot 0 on the device [m], float32 (H, W); good until the next call."""
+        inputs = [self.depth[0], self.scale, self._metres]
+        wp.launch(image_kernels.to_metres, self._metres.shape, inputs, device=self.device, record_tape=False)
+        return self._metres
 
     def current(self) -> tuple[np.ndarray, np.ndarray, float]:
         """What slot 0 holds: colour, uint16 depth, and its scale."""
-        return self.rgb[0].numpy(), self.depth[0].numpy(), float(self.scale.numpy()[0])
+        return self._current
+
+    def current_depth(self) -> np.ndarray:
+        """Depth of slot 0 as the kernels read it [m], float32 (H, W)."""
+        _, depth, scale = self._current
+        return depth.astype(np.float32) * np.float32(scale)
 
     def restore(self, current: tuple[np.ndarray, np.ndarray, float], images: list[CompactImage]) -> None:
         """Put back what `current` and `images` were."""
