@@ -27,7 +27,7 @@ def main(frame_count: int = 20, *, settings: Sequence[str] = SETTINGS) -> warpsl
     statuses: Counter[str] = Counter()
     for rgb, depth, time in frames_of_my_camera(frame_count):
         result = slam.step(rgb, depth, time, depth_scale=1000)
-        statuses[result.status] += 1
+        statuses[str(result.status)] += 1
         if result.status != "OK":  # LOST: the camera was not found; SKIPPED: nothing usable in the images
             print(f"frame {result.index} at {time:.2f} s is {result.status}: {result.message}")
     slam.finish()
