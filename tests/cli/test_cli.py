@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from trimesh.proximity import closest_point_naive
 
 from tests.fakes import FakeSequence, FakeSlam, Terminal, wall
-from warpslam import cli
+from warpslam import __version__, cli
 from warpslam.cli.common import parse_frames
+from warpslam.errors import DatasetError
+from warpslam.field.decoders import random_decoders
 from warpslam.pipeline import finished as revisit
 from warpslam.pipeline import run as pipeline
 from warpslam.storage.json_files import read_json
@@ -140,8 +144,6 @@ def test_errors_are_one_line_and_exit_2(arguments, message, tmp_path, capsys):
 
 def test_debug_shows_the_traceback():
     """With --debug the exception comes through."""
-    from warpslam.errors import DatasetError
-
     with pytest.raises(DatasetError):
         cli.main(["eval", "/no/such/run", "--debug"])
 
@@ -168,8 +170,6 @@ def test_frames_are_a_python_slice(text, expected):
 
 def test_eval_prints_figures(faked, tmp_path, capsys):
     """RMSE aligned and unaligned in cm, RPE, and how many frames were compared; --json gives the same as JSON."""
-    import json
-
     run = str(tmp_path / "run")
     cli.main(["run", "seq", "-o", run])
     capsys.readouterr()
@@ -236,15 +236,11 @@ def test_demo_sequence_is_small_and_exact():
     z, k = frame.depth[v, u][keep].astype(float), sequence.intrinsics
     points = np.stack([(u[keep] - k.cx) / k.fx * z, (v[keep] - k.cy) / k.fy * z, z, np.ones_like(z)])
     world = (frame.T_world_camera @ points)[:3].T
-    from trimesh.proximity import closest_point_naive
-
     assert closest_point_naive(sequence.mesh, world)[1].max() < 0.01
 
 
 def test_info_names_versions_devices_and_decoders(capsys, tmp_path):
     """One screen that a bug report needs, with the decoder file that is asked about."""
-    from warpslam.field.decoders import random_decoders
-
     random_decoders().save(tmp_path / "d.pth")
     assert cli.main(["info", "--decoders", str(tmp_path / "d.pth")]) == 0
     out = capsys.readouterr().out
@@ -308,12 +304,10 @@ def test_shared_options_read_alike(command, capsys):
 
 def test_version(capsys):
     """The version is that of the package."""
-    import warpslam
-
     with pytest.raises(SystemExit) as exit_:
         cli.main(["--version"])
     assert exit_.value.code == 0
-    assert capsys.readouterr().out.strip() == f"warpslam {warpslam.__version__}"
+    assert capsys.readouterr().out.strip() == f"warpslam {__version__}"
 
 
 def test_progress_bar_on_a_terminal(monkeypatch, faked, tmp_path):

@@ -13,8 +13,8 @@ import pytest
 import warp as wp
 
 from tests.test_slam import new_slam
-from tools.gpu import check, ptx_on_cpu
-from warpslam.config import PRESETS
+from tools.gpu import check, check_kernels, ptx_on_cpu
+from warpslam.config import PRESETS, Config
 from warpslam.synthetic import SyntheticSequence
 
 FOLDER = Path(check.__file__).parent
@@ -59,17 +59,11 @@ def test_what_the_steps_name_exists():
     """Presets with their settings, test files and single tests; the engine's tests are real ones."""
     for preset, overrides in check.REPLICA_RUNS:
         assert preset in PRESETS
-        check_config(preset, overrides)
+        Config.from_preset(preset, list(overrides))
     for test in (*check.KERNEL_TESTS, *check.NOT_ON_A_DEVICE, *check.ENGINE_TESTS):
         path, _, name = test.partition("::")
         assert (ROOT / path).exists(), test
         assert not name or f"def {name}(" in (ROOT / path).read_text(), test
-
-
-def check_config(preset: str, overrides: tuple[str, ...]) -> None:
-    from warpslam.config import Config
-
-    Config.from_preset(preset, list(overrides))
 
 
 @pytest.mark.parametrize("copied", [False, True])
@@ -139,8 +133,6 @@ def test_slam_is_moved_to_the_device_that_is_named(tmp_path):
 def test_a_kernel_runs_from_ptx(tmp_path, monkeypatch):
     """The adjoint is left out; blocks, threads, arguments and branches of the PTX give what the CPU backend gives."""
     monkeypatch.setattr(ptx_on_cpu, "CACHE", tmp_path)
-    from tools.gpu import check_kernels
-
     n = 700  # three blocks, the last of them not full
     x = wp.array(np.arange(n, dtype=np.float32), device="cpu")
     y = wp.zeros(n, dtype=float, device="cpu")

@@ -23,6 +23,6 @@ if TYPE_CHECKING:
 
 def profile() -> Profile:
     """A profile of what runs inside the ``with`` block, on all threads; see `warpslam.profiling.session.Profile`."""
-    from warpslam.profiling.session import Profile
+    from warpslam.profiling.session import Profile  # with Warp, which `warpslam.profile` alone does not need
 
     return Profile()

@@ -6,15 +6,13 @@ import io
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 
 from warpslam.profiling.records import Launch, Recording
 from warpslam.storage.json_files import to_json
-
-if TYPE_CHECKING:
-    from rich.table import Table
 
 
 @dataclass
@@ -134,8 +132,6 @@ class Report:
 
     def table(self, width: int) -> str:
         """The tables as text, ``width`` characters wide."""
-        from rich.console import Console
-
         console = Console(file=io.StringIO(), width=width)
         for table in self.tables():
             console.print(table)
@@ -255,8 +251,6 @@ def _covered(intervals: Iterable[tuple[float, float]]) -> float:
 
 
 def _table(title: str, names: list[str], figures: list[str]) -> Table:
-    from rich.table import Table
-
     table = Table(title=title, title_justify="left")
     for name in names:
         table.add_column(name, overflow="fold")
