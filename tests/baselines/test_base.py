@@ -67,8 +67,9 @@ def test_a_saved_map_goes_on_where_it_was(counter, tmp_path):
     ("name", "value"),
     [
         ("seed", -1), ("config", {"grid": {"margin": -1}}), ("config", None), ("intrinsics", {"fx": 1}),
-        ("intrinsics", []), ("status", np.zeros(2, np.uint8)), ("status", np.array([0, 0, 9], np.uint8)), ("status", np.zeros(3)),
-        ("poses", np.zeros((3, 6))), ("first", -1), ("motion", np.full((4, 4), np.nan)), ("timestamps", np.zeros(2)), ("sum", np.zeros(2)), ("sum", np.full(1, np.nan)),
+        ("intrinsics", []), ("status", np.zeros(2, np.uint8)), ("status", np.array([0, 0, 9], np.uint8)),
+        ("status", np.zeros(3)), ("poses", np.zeros((3, 6))), ("first", -1), ("motion", np.full((4, 4), np.nan)),
+        ("timestamps", np.zeros(2)), ("sum", np.zeros(2)), ("sum", np.full(1, np.nan)),
     ],
 )  # fmt: skip
 def test_every_field_is_checked(counter, tmp_path, name, value):

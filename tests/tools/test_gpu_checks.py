@@ -102,8 +102,8 @@ def engine():
 def test_each_launch_of_an_iteration_is_timed(engine):
     """The record of a mapping iteration is found, and all its launches have a time; the engine's calls still run."""
     slam, frame = engine
-    program = slam._mapper._launcher._kinds["color"][1]
-    figures = check.examine(program, slam._mapper._batch, repeats=1)
+    program = slam.mapper._launcher._kinds["color"][1]
+    figures = check.examine(program, slam.mapper._batch, repeats=1)
     names = {row["kernel"] for row in figures["rows"]}
     assert {"middle_forward", "color_backward", "composite", "adam_rows"} <= names
     assert all(row["us"] > 0 for row in figures["rows"]) and figures["launches"] == len(figures["rows"])
