@@ -225,8 +225,10 @@ def _metres(depth: np.ndarray, depth_scale: float | None, max_depth: float) -> n
     elif not np.issubdtype(depth.dtype, np.floating):
         raise FrameError(f"depth has dtype {depth.dtype}, expected float [m] or uint16 with depth_scale")
     with np.errstate(over="ignore"):
-        depth = depth.astype(np.float32)
-    usable = np.isfinite(depth) & (depth > 0) & (depth <= max_depth)
+        depth = depth.astype(np.float32, copy=False)
+    usable = (depth > 0) & (depth <= max_depth)  # NaN is neither
+    if not math.isfinite(max_depth):
+        usable &= np.isfinite(depth)
     count = np.count_nonzero(usable)
     if count < MIN_DEPTH_PIXELS:
         within = f" within {max_depth:g} m" if math.isfinite(max_depth) else ""

@@ -268,7 +268,7 @@ class Slam:
 
     def _insert_keyframe(self, frame: AdmittedFrame, account: _Account) -> None:
         with account.timed("keyframe"):
-            image = self.images.add(frame.rgb, frame.depth)
+            image = self.images.keep_current()
             self.keyframes.append(Keyframe(frame.index, image, self.history.pose(frame.index)))
 
     def _refine(self, index: int, first_round: int, rounds: int) -> None:
@@ -400,7 +400,7 @@ class Slam:
             history=self.history.state(),
             scene=self.scene.state(),
             current_image=self.images.current(),
-            keyframes=[(keyframe, self.images.images[keyframe.image]) for keyframe in self.keyframes],
+            keyframes=[(keyframe, self.images.kept(keyframe.image)) for keyframe in self.keyframes],
             seen=self._seen,
             current=self._current,
             mapped=self._mapped,

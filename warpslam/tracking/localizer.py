@@ -79,7 +79,7 @@ class Localizer:
         current = Thumbnail.of(rgb, depth * np.float32(scale))
         for keyframe in keyframes:
             if keyframe.image not in self._thumbnails:
-                rgb, depth, scale = images.images[keyframe.image].unpack(self.camera)
+                rgb, depth, scale = images.kept(keyframe.image).unpack(self.camera)
                 self._thumbnails[keyframe.image] = Thumbnail.of(rgb, depth * np.float32(scale))
         return sorted(keyframes, key=lambda keyframe: current.difference(self._thumbnails[keyframe.image]))
 
