@@ -9,9 +9,10 @@ import numpy as np
 import warp as wp
 
 from warpslam.field.arrays import struct
-from warpslam.field.decoders import EMBEDDING_SCALE, EMBEDDING_SIZE
+from warpslam.field.complexity import imap_shapes
+from warpslam.field.decoders import EMBEDDING_SCALE
 from warpslam.field.ray_batch import RayBatch
-from warpslam.kernels import imap_density as density
+from warpslam.kernels import imap_density
 from warpslam.kernels import imap_network as imap
 from warpslam.kernels import rays
 from warpslam.kernels.compositing import Box
@@ -147,10 +148,10 @@ class ImapBatch(RayBatch):
         return self.logit
 
     @property
-    def composited(self) -> density.Composited:
+    def composited(self) -> imap_density.Composited:
         """The samples as compositing takes them."""
         return struct(
-            density.Composited,
+            imap_density.Composited,
             order=self.order,
             density=self.density,
             color=self.color,
@@ -181,18 +182,18 @@ class ImapBatch(RayBatch):
             ray_count = stop - first
             inputs = [first, self.draws, int(jitter), self.stratified, int(use_depth)]
             inputs += [self.measured_depth, self.t_exit, self.max_depth, self.rays]
-            result: list[Step] = [(density.place_stratified, ray_count, inputs)]
+            result: list[Step] = [(imap_density.place_stratified, ray_count, inputs)]
             if self.empty:
                 inputs = [first, self.draws, self.visible, self.empty, self.measured_depth, self.rays]
-                result.append((density.place_empty, ray_count, inputs))
+                result.append((imap_density.place_empty, ray_count, inputs))
             result += self._forward(network, first, stop, 0, self.stratified)
             inputs = [first, self.stratified, self.importance, self.keep, *corners]
             inputs += [self.density, self.weight, self.order]
-            result.append((density.place_importance, ray_count, inputs))
+            result.append((imap_density.place_importance, ray_count, inputs))
             result += self._forward(network, first, stop, self.stratified, samples - self.stratified)
             inputs = [first, self.visible, self.keep, *corners, self.composited]
             inputs += [self.depth, self.variance, self.rgb]
-            result.append((density.composite, ray_count, inputs))
+            result.append((imap_density.composite, ray_count, inputs))
             return result
 
         self.launcher.slices(self.count, steps)
@@ -204,7 +205,7 @@ class ImapBatch(RayBatch):
     def add_empty_loss(self, empty_weight: float) -> None:
         """Add the sum of ``empty_weight`` |density| over the empty samples to `loss`."""
         inputs = [self.visible, self.sample_count, empty_weight, self.keep, self.density, self.loss]
-        self.launcher.launch(density.empty_loss, self.count, inputs)
+        self.launcher.launch(imap_density.empty_loss, self.count, inputs)
 
     def query_points(self, network: ImapNetwork, points: np.ndarray) -> None:
         """Density and colour at points (N, 3) in network units; needs a batch of one sample a ray."""
@@ -234,7 +235,7 @@ class ImapBatch(RayBatch):
         span = struct(Span, point_count=count, first_ray=first, first_sample=0, width=samples)
         parts = struct(imap.Chunks, start=start, stop=end, size=_CHUNK, slot=slot)
         gradient = struct(
-            density.CompositeGradient,
+            imap_density.CompositeGradient,
             depth_grad=self.depth.grad,
             rgb_grad=self.rgb.grad,
             density_grad=self.logit_grad,
@@ -242,7 +243,7 @@ class ImapBatch(RayBatch):
         )
         inputs = [first, self.visible, self.keep, struct(Box, low=bound.low, high=bound.high), self.rays]
         inputs += [self.composited, empty_weight, gradient]
-        result: list[Step] = [(density.composite_backward, stop - first, inputs)]
+        result: list[Step] = [(imap_density.composite_backward, stop - first, inputs)]
         d, other = self._d
         inputs = [start, W, self.layers[-1], self.color_grad, self.logit_grad, d]
         result.append((kernels.output_backward, count, inputs))
@@ -281,19 +282,3 @@ def _layer(in_blocks: int, W: wp.array, row: int, bias: wp.array, bias_row: int)
 def _channels(x: wp.array) -> wp.array:
     """The same memory with the 32 channels of a `Vec32` as a third axis."""
     return wp.array(ptr=x.ptr, dtype=float, shape=(*x.shape, 32), device=x.device, copy=False)
-
-
-IMAP_HIDDEN = 256
-IMAP_LAYERS = 4
-IMAP_OUTPUTS = 4  # red, green, blue, density
-
-
-def imap_shapes() -> dict[str, tuple[int, ...]]:
-    """Name and shape, (out, in), of every tensor of the network of iMAP*."""
-    shapes: dict[str, tuple[int, ...]] = {"embedder._B": (3, EMBEDDING_SIZE)}
-    for k in range(IMAP_LAYERS):
-        shapes[f"pts_linears.{k}.weight"] = (IMAP_HIDDEN, EMBEDDING_SIZE if k == 0 else IMAP_HIDDEN)
-        shapes[f"pts_linears.{k}.bias"] = (IMAP_HIDDEN,)
-    shapes["output_linear.weight"] = (IMAP_OUTPUTS, IMAP_HIDDEN)
-    shapes["output_linear.bias"] = (IMAP_OUTPUTS,)
-    return shapes

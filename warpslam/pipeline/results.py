@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import logging
 import os
 import platform
@@ -88,7 +87,7 @@ class RunResults:
     metrics: dict[str, Any] = field(default_factory=dict)
 
     def _write_input(self) -> None:
-        self.config.save(self.folder.config)
+        self.config.resolved().save(self.folder.config)
         if self.source is not None:
             self.folder.write_source(self.source)
         log.info("%s: %d of %d frames, %s", self.sequence.name, len(self.selected), len(self.sequence), self.selected)
@@ -106,10 +105,7 @@ class RunResults:
     def _trajectory(self) -> tuple[Trajectory, int]:
         """The trajectory, and how many of its poses belong to frames that were finished."""
         assert self.slam is not None
-        trajectory, first = self.slam.trajectory, self.first_index
-        if first:
-            parts = (trajectory.timestamps[first:], trajectory.poses[first:], trajectory.status[first:])
-            trajectory = dataclasses.replace(trajectory, timestamps=parts[0], poses=parts[1], status=parts[2])
+        trajectory = self.slam.trajectory.after(self.first_index)
         # After an interrupt the trajectory may hold the pose of a frame that never came back.
         return trajectory, len(self.results)
 
@@ -141,13 +137,9 @@ class RunResults:
         self.metrics["map"] = {"bytes": self.slam.map_bytes, "flops_per_point": self.slam.flops_per_point}
 
     def _describe_map(self) -> None:
-        from warpslam.scene.inventory import take_inventory
-        from warpslam.slam import Slam
-
-        if isinstance(self.slam, Slam):
-            with self._clock("inventory"):
-                self.metrics.update(take_inventory(self.slam))
-                self.metrics["memory"] = self.slam.memory()
+        assert self.slam is not None
+        with self._clock("inventory"):
+            self.metrics.update(self.slam.inventory())
 
     def _write_mesh(self) -> None:
         assert self.slam is not None

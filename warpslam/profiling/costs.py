@@ -23,31 +23,33 @@ import warp as wp
 
 from warpslam.field.complexity import decoder_shapes, flops_per_point
 from warpslam.field.decoders import EMBEDDING_SIZE, FEATURE_SIZE, MAX_HIDDEN
+from warpslam.kernels.compositing import COUNT_STRIDE
+from warpslam.kernels.decoder.layout import OUT_64
 
 ROW_BYTES = 4 * FEATURE_SIZE
 
 
 @dataclass(frozen=True)
 class Work:
-    """What one launch does.
-
-    points: Samples (or queried points) it computes; None for kernels that do not work on samples.
-    flop: Floating-point operations, for the decoders only.
-    bytes: Read and written, for kernels that do little else; 0 for the others.
-    counted: Whether skipped points are left out of ``points``; else it is an upper bound.
-    """
+    """What one launch does."""
 
     points: int | None = None
+    """Samples (or queried points) it computes; None for kernels that do not work on samples."""
     flop: float = 0.0
+    """Floating-point operations, for the decoders only."""
     bytes: float = 0.0
+    """Read and written, for kernels that do little else; 0 for the others."""
     counted: bool = True
+    """Whether skipped points are left out of ``points``; else it is an upper bound."""
 
 
 NOTHING = Work()
 
 
 class Arguments:
-    """Arguments of a launch by name, fields of structs as ``argument.field``, either packed for the CPU (``values`` ctypes) or as they were given."""
+    """Arguments of a launch by name, fields of structs as ``argument.field``: packed for the CPU (``values`` ctypes), or
+    as they were given.
+    """
 
     def __init__(self, kernel: wp.Kernel, values: Sequence[Any], *, readable: bool) -> None:
         self._position = _positions(kernel)
@@ -178,8 +180,6 @@ def _backward(level: str | None = None) -> Model:
 
 def _listed(each: int, threads: int, arguments: Arguments) -> Work:
     """Work on the samples of a list; where its length can't be read, one a thread."""
-    from warpslam.kernels.compositing import COUNT_STRIDE
-
     try:
         points = arguments.integer("listed.counts", COUNT_STRIDE * arguments.number("listed.slot"))
     except KeyError:
@@ -195,8 +195,6 @@ def _optional(arguments: Arguments, name: str) -> Any:
 
 
 def _level_of(arguments: Arguments) -> str:
-    from warpslam.kernels.decoder.layout import OUT_64
-
     return "fine" if arguments.number("output_row") == OUT_64 else "middle"
 
 
