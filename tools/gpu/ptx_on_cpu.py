@@ -216,7 +216,8 @@ class Runner:
 
         for argument, value in zip(kernel.adj.args, values, strict=True):
             params.append(_object(wpc.pack_arg(kernel, argument.type, argument.label, value, device, False)))
-            add(value)
+            for array in _arrays(value):
+                add(array)
             if isinstance(value, wp.array):
                 add(value.grad)
         if gradients is not None:
@@ -266,6 +267,12 @@ def _extent(array: Any) -> int:
 
     last = sum((n - 1) * s for n, s in zip(array.shape, array.strides, strict=True))
     return last + wp.types.type_size_in_bytes(array.dtype)
+
+
+def _arrays(value: Any) -> list[Any]:
+    """The argument itself, or what a struct holds."""
+    fields = getattr(getattr(value, "_cls", None), "vars", None)
+    return [value] if fields is None else [array for name in fields for array in _arrays(getattr(value, name))]
 
 
 def _object(value: Any) -> Any:

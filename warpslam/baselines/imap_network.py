@@ -12,9 +12,8 @@ from warpslam.field.arrays import struct
 from warpslam.field.complexity import imap_shapes
 from warpslam.field.decoders import EMBEDDING_SCALE
 from warpslam.field.ray_batch import RayBatch
-from warpslam.kernels import imap_density
+from warpslam.kernels import imap_density, rays
 from warpslam.kernels import imap_network as imap
-from warpslam.kernels import rays
 from warpslam.kernels.compositing import Box
 from warpslam.kernels.grid import Vec32
 from warpslam.kernels.samples import Span

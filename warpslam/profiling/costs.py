@@ -47,8 +47,9 @@ NOTHING = Work()
 
 
 class Arguments:
-    """Arguments of a launch by name, fields of structs as ``argument.field``: packed for the CPU (``values`` ctypes), or
-    as they were given.
+    """Arguments of a launch by name, fields of structs as ``argument.field``.
+
+    They are packed for the CPU (``values`` ctypes), or as they were given.
     """
 
     def __init__(self, kernel: wp.Kernel, values: Sequence[Any], *, readable: bool) -> None:
