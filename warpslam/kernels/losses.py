@@ -11,6 +11,8 @@ have no gradient.
 
 import warp as wp
 
+wp.set_module_options({"block_dim": 32})
+
 
 @wp.func
 def l1(a: wp.vec3, b: wp.vec3) -> float:
