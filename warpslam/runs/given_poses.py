@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-import numpy as np
-from pathlib import Path
 from dataclasses import dataclass
-from warpslam.storage.tum import associate, read_tum
+from pathlib import Path
 
+import numpy as np
+
+from warpslam.storage.tum import associate, read_tum
 
 
 @dataclass(frozen=True)
 class GivenPoses:
-    """Poses that a file gives to frames, by time.
-
-    path: File. times: [s], shape (N,). poses: T_world_camera, shape (N, 4, 4).
-    """
+    """Poses that a file gives to frames, by time."""
 
     path: Path
+    """The file."""
+
     times: np.ndarray
+    """[s], shape (N,)."""
+
     poses: np.ndarray
+    """T_world_camera, shape (N, 4, 4)."""
 
     @classmethod
     def read(cls, path: str | Path) -> GivenPoses:
