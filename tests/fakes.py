@@ -142,8 +142,8 @@ class FakeSlam:
         mesh.visual.vertex_colors = np.tile(np.uint8([10, 20, 30, 255]), (len(mesh.vertices), 1))
         return mesh
 
-    def memory(self) -> dict[str, float | None]:
-        return {"state_bytes": 8}
+    def inventory(self) -> dict[str, object]:
+        return {"memory": {"state_bytes": 8}}
 
     def save(self, path: Path) -> None:
         Path(path).write_bytes(b"fake map")

@@ -9,10 +9,14 @@ from tests.fakes import run_sequence
 from warpslam.baselines.imap import Imap
 from warpslam.camera import Intrinsics
 from warpslam.config import PRESETS, Config
-from warpslam.errors import CheckpointError, InputError
+from warpslam.errors import CheckpointError, ConfigError, InputError
 from warpslam.evaluation import psnr
+from warpslam.pipeline.finished import extract_mesh
 from warpslam.pipeline.setup import load_slam
 from warpslam.runs.folder import RunFolder
+from warpslam.slam_state import saved_config
+from warpslam.storage.state_file import read_state, write_state
+from warpslam.trajectory import FrameHistory, Located
 
 CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5, 64, 48)
 SMALL = [
@@ -78,14 +82,17 @@ def test_tracking_follows_a_moved_camera(trained):
     before = trained.network.weights.numpy().copy()
     start = trained._scaled(np.array([1.0, 0, 0, 0, 0.0, 0.0, 0.08]))
     trained._images.set(0, rgb, depth * np.float32(trained._settings.scale))
-    _, loss_before, error_before, _ = trained._judge(1, start)
-    trained._vectors.append(np.array([1.0, 0, 0, 0, 0.0, 0.0, 0.08]))
+    before_it, loss_before = trained._judge(1, start)
+    history, trained.history = trained.history, FrameHistory()
+    aside = np.eye(4)
+    aside[2, 3] = 0.08
+    trained.history.add(0.0, Located(aside))
     try:
-        vector, loss, error, kept = trained._track(1)
+        located, loss = trained._track(1)
     finally:
-        trained._vectors.pop()
-    assert loss < loss_before and error < error_before and kept > 0.9
-    assert abs(vector[6]) < 0.078
+        trained.history = history
+    assert loss < loss_before and located.depth_error < before_it.depth_error and located.inliers > 0.9
+    assert abs(located.T_world_camera[2, 3]) < 0.078
     np.testing.assert_array_equal(trained.network.weights.numpy(), before)
 
 
@@ -128,18 +135,32 @@ def test_given_poses_are_taken(trained):
 
 def test_save_and_load(trained, tmp_path):
     """A map read back renders the same view; a damaged or foreign file is refused."""
-    trained.save(tmp_path / "map.npz")
-    again = Imap.load(tmp_path / "map.npz", "cpu")
+    trained.save(tmp_path / "map.safetensors")
+    again = Imap.load(tmp_path / "map.safetensors", "cpu")
     _, _, pose = corner()
     a, b = trained.render(pose, stride=4), again.render(pose, stride=4)
     np.testing.assert_array_equal(a.depth, b.depth)
     np.testing.assert_array_equal(a.rgb, b.rgb)
     assert again.config.imap.mapping_pixels == 48
-    (tmp_path / "bad.npz").write_bytes((tmp_path / "map.npz").read_bytes()[:500])
+    (tmp_path / "bad.safetensors").write_bytes((tmp_path / "map.safetensors").read_bytes()[:500])
     np.savez(tmp_path / "other.npz", header=np.frombuffer(b'{"format": "x"}', np.uint8))
-    for name in ("bad.npz", "none.npz", "other.npz"):
+    for name in ("bad.safetensors", "none.safetensors", "other.npz"):
         with pytest.raises(CheckpointError, match=name):
             Imap.load(tmp_path / name)
+    header, arrays = read_state(tmp_path / "map.safetensors", Imap.form)
+    for name, array in arrays.items():
+        write_state(tmp_path / "bad.safetensors", Imap.form, header, {**arrays, name: array[None]})
+        with pytest.raises(CheckpointError, match=name):
+            Imap.load(tmp_path / "bad.safetensors", "cpu")
+
+
+def test_a_network_that_saw_nothing_can_be_saved(tmp_path):
+    """Without a frame there is no bound; what comes back takes its first frame."""
+    run(0).save(tmp_path / "map.safetensors")
+    again = Imap.load(tmp_path / "map.safetensors", "cpu")
+    assert not np.isfinite(again.bounds).any() and len(again.trajectory.poses) == 0
+    rgb, depth, pose = corner()
+    assert again.step(rgb, depth, T_world_camera=pose).status == "OK"
 
 
 def test_nothing_is_rendered_before_the_first_frame():
@@ -161,8 +182,16 @@ def test_a_run_writes_its_folder(tmp_path):
     assert result.status == "finished" and result.metrics.method == "imap"
     assert result.metrics.to_dict()["map"] == {"bytes": 890_988, "flops_per_point": 443_908}
     assert result.ate is not None and result.metrics.rendering.depth_l1_m > 0
-    loaded = load_slam(RunFolder.open(tmp_path))
+    folder = RunFolder.open(tmp_path)
+    loaded = load_slam(folder)
     assert isinstance(loaded, Imap) and len(loaded.trajectory.poses) == 2
+    with pytest.raises(ConfigError, match="method imap has no refinement"):
+        extract_mesh(folder, refinement_rounds=1)
+    with pytest.raises(ConfigError, match="method imap forecasts nothing"):
+        extract_mesh(folder, forecast=True)
+    with pytest.raises(CheckpointError, match="'warpslam-imap'.*--method nice-slam"):
+        saved_config(folder.map)
+    assert not folder.forecast_mesh.exists()
 
 
 def test_the_released_settings_are_a_preset():

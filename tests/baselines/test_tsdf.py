@@ -11,11 +11,13 @@ from tests.fakes import run_sequence
 from warpslam.baselines.tsdf import BLOCK_VOXELS, Tsdf, import_open3d
 from warpslam.camera import Intrinsics
 from warpslam.config import Config
-from warpslam.errors import CheckpointError, InputError, MeshError, MissingDependencyError
+from warpslam.errors import CheckpointError, ConfigError, InputError, MeshError, MissingDependencyError
+from warpslam.pipeline.finished import extract_mesh
 from warpslam.pipeline.setup import load_slam
 from warpslam.poses import pose_from_vector
 from warpslam.runs.folder import RunFolder
 from warpslam.storage.json_files import read_json
+from warpslam.storage.state_file import read_state, write_state
 
 CAMERA = Intrinsics(80.0, 80.0, 63.5, 47.5, 128, 96)
 RGB = (200, 100, 50)
@@ -98,18 +100,23 @@ def test_frames_without_a_pose_are_skipped():
 
 def test_save_and_load(wall, tmp_path):
     """What was saved is read back: same mesh, same trajectory, and fusion goes on."""
-    wall.save(tmp_path / "map.npz")
-    again = Tsdf.load(tmp_path / "map.npz")
+    wall.save(tmp_path / "map.safetensors")
+    again = Tsdf.load(tmp_path / "map.safetensors")
     assert again.map_bytes == wall.map_bytes and again.config == wall.config
     np.testing.assert_array_equal(again.trajectory.poses, wall.trajectory.poses)
     a, b = wall.mesh(), again.mesh()
     assert len(a.faces) == len(b.faces)
     np.testing.assert_allclose(np.sort(a.vertices[:, 0]), np.sort(b.vertices[:, 0]), atol=1e-6)
     assert again.step(*wall_images(), T_world_camera=np.eye(4)).index == 3
-    (tmp_path / "bad.npz").write_bytes((tmp_path / "map.npz").read_bytes()[:300])
-    for name in ("bad.npz", "none.npz"):
+    (tmp_path / "bad.safetensors").write_bytes((tmp_path / "map.safetensors").read_bytes()[:300])
+    for name in ("bad.safetensors", "none.safetensors"):
         with pytest.raises(CheckpointError, match=name):
             Tsdf.load(tmp_path / name)
+    header, arrays = read_state(tmp_path / "map.safetensors", Tsdf.form)
+    for name, array in arrays.items():
+        write_state(tmp_path / "bad.safetensors", Tsdf.form, header, {**arrays, name: array[None]})
+        with pytest.raises(CheckpointError, match=name):
+            Tsdf.load(tmp_path / "bad.safetensors")
 
 
 def test_settings_reach_the_volume():
@@ -152,5 +159,10 @@ def test_a_run_with_the_poses_of_an_earlier_one(tmp_path):
     shifted = run_sequence(sequence, config, tmp_path / "b", method="tsdf", poses=str(tmp_path / "given.tum"))
     assert shifted.metrics.frames.processed == 4 and shifted.metrics.frames.unreadable == 2
     assert read_json(shifted.folder.metrics)["ate_m"]["unaligned"]["rmse"] == pytest.approx(0.1, abs=1e-6)
-    loaded = load_slam(RunFolder.open(tmp_path / "b"))
+    folder = RunFolder.open(tmp_path / "b")
+    loaded = load_slam(folder)
     assert isinstance(loaded, Tsdf) and len(loaded.trajectory.poses) == 4
+    with pytest.raises(ConfigError, match="method tsdf has no refinement"):
+        extract_mesh(folder, refinement_rounds=1)
+    with pytest.raises(ConfigError, match="method tsdf forecasts nothing"):
+        extract_mesh(folder, forecast=True)

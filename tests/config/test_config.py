@@ -64,6 +64,62 @@ def test_yaml_round_trip(tmp_path):
     assert Config.load(tmp_path / "config.yaml") == config
 
 
+def test_given_poses_decide_what_was_left_open():
+    """No bundle adjustment, and a start from depth unless it is off; without them all is as it was asked for."""
+    given = Config.from_preset("default", ["tracking.use_given_poses=true"]).resolved().mapping
+    assert (given.bundle_adjustment, given.depth_start) == (False, True)
+    tracked = Config().resolved().mapping
+    assert (tracked.bundle_adjustment, tracked.depth_start) == (True, False)
+    for name in PRESETS:
+        for overrides in ([], ["tracking.use_given_poses=true"], ["mapping.depth_start=true"]):
+            config = Config.from_preset(name, overrides)
+            before = config.model_dump()
+            resolved = config.resolved()
+            assert resolved.resolved() == resolved and config.model_dump() == before
+            assert bool(resolved.mapping.depth_start) is (
+                config.mapping.depth_start is not False
+                if config.tracking.use_given_poses
+                else bool(config.mapping.depth_start)
+            )
+            changed = [
+                name
+                for name, value in before["mapping"].items()
+                if bool(value) != bool(getattr(resolved.mapping, name))
+            ]
+            assert set(changed) <= {"bundle_adjustment", "depth_start"}
+            assert config.tracking.use_given_poses or not changed
+
+
+def test_what_followed_from_given_poses_ends_with_them():
+    """A map that was made with given poses, and is tracked in: bundle adjustment is back, unless it was said not to."""
+    given = Config.from_preset("default", ["tracking.use_given_poses=true"]).resolved()
+    off = "tracking.use_given_poses=false"
+    tracked = given.updated([off]).mapping
+    assert tracked.bundle_adjustment and tracked.depth_start is None
+    assert not given.updated([off, "mapping.bundle_adjustment=false"]).mapping.bundle_adjustment
+    assert not given.updated(["mapping.iterations=9"]).mapping.bundle_adjustment
+    kept = Config.from_preset("default", ["mapping.bundle_adjustment=false"]).updated([off])
+    assert not kept.mapping.bundle_adjustment
+
+
+def test_settings_of_a_file_with_overrides(tmp_path):
+    """Overrides win over the file, which wins over the defaults; a file may name a single field."""
+    path = tmp_path / "mine.yaml"
+    path.write_text("mapping: {iterations: 7, pixels: 500}\n")
+    config = Config.from_file(path, ["mapping.pixels=600"])
+    assert (config.mapping.iterations, config.mapping.pixels) == (7, 600)
+    assert config.tracking == Config().tracking
+    config.save(tmp_path / "all.yaml")
+    assert Config.from_file(tmp_path / "all.yaml") == config
+    for text, message in (("", "mine.yaml: expected a mapping"), ("mapping: {n: 1}", "mine.yaml: mapping.n")):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=message):
+            Config.from_file(path)
+    path.write_text("mapping: {iterations: 7}")
+    with pytest.raises(ConfigError, match="mapping.pixels"):
+        Config.from_file(path, ["mapping.pixels=-1"])
+
+
 @pytest.mark.parametrize("text", ["- a list", "mapping: {iterations: many}", "mapping: [", "\x00"])
 def test_unusable_yaml_is_a_config_error_with_the_file(tmp_path, text):
     """Not a mapping, a wrong type, broken yaml: the file is named."""

@@ -36,7 +36,7 @@ def test_resolving_leaves_nothing_open_and_repeats():
     resolved = request.resolved("default", range(2, 9, 3), "cpu")
     assert (resolved.preset, resolved.overrides, resolved.decoders) == (None, (), None)
     assert (resolved.frames, resolved.device) == ((2, 9, 3), "cpu")
-    assert resolved.config == Config.from_preset("replica", list(OVERRIDES)).with_files("d.pth")
+    assert resolved.config == Config.from_preset("replica", list(OVERRIDES)).with_files("d.pth").resolved()
     assert resolved.resolved("scannet", range(2, 9, 3), "cpu") == resolved
 
 

@@ -12,42 +12,39 @@ not rendered along normals.
 
 from __future__ import annotations
 
-import json
-import os
 import time
-import zipfile
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from warpslam.baselines.base import Baseline
-from warpslam.baselines.imap_network import Bound, ImapBatch, ImapNetwork, Wanted
+from warpslam.baselines.imap_network import Bound, ImapBatch, ImapNetwork, Wanted, imap_shapes
 from warpslam.camera import Intrinsics
 from warpslam.config import Config
-from warpslam.errors import CheckpointError, InputError
+from warpslam.errors import InputError
 from warpslam.field.complexity import flops_per_point, weight_count
 from warpslam.field.rendering import RenderedImage
 from warpslam.field.seeds import ray_seed
-from warpslam.frames import FrameResult
+from warpslam.frames import AdmittedFrame, FrameResult
 from warpslam.kernels import adam, losses, rays
 from warpslam.kernels import imap_density as density
 from warpslam.kernels import imap_network as imap
-from warpslam.meshing import ObservedView, extract_mesh
+from warpslam.meshing import extract_mesh
 from warpslam.poses import check_transform, pose_from_vector, vector_from_pose
 from warpslam.runtime.launching import Launcher, synchronize
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
-from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
+from warpslam.scene.mapped_views import SEEN_STRIDE, ObservedView, SeenDepth
 from warpslam.scene.optimizers import PoseOptimizer, RowOptimizer
+from warpslam.storage.state_file import StateFields, StateFormat
+from warpslam.trajectory import Located
 
 if TYPE_CHECKING:
     import trimesh
 
-FORMAT = "warpslam-imap-1"
 TRACKING_COLOR_WEIGHT = 0.5
 DECAY, DECAY_STEPS = 0.8, 200
 # Samples of a rendered view, which has no depth to guide them.
@@ -60,6 +57,7 @@ class Imap(Baseline):
     """iMAP* under the interface of `warpslam.slam.Slam`. Settings: `ImapConfig` and what that names."""
 
     name = "imap"
+    form = StateFormat("warpslam-imap", 2, "the map of a run with --method imap")
 
     def __init__(
         self, intrinsics: Intrinsics, config: Config | None = None, device: str | None = None, seed: int = 0
@@ -72,7 +70,7 @@ class Imap(Baseline):
             device: Warp device, "cpu" or "cuda:0"; by default CUDA where there is one.
             seed: Of the initial network and of every random choice. Same input, seed and device: same result.
         """
-        super().__init__(intrinsics, config if config is not None else Config(), seed)
+        super().__init__(intrinsics, config, device, seed)
         self.device = wp.get_device(device)
         self.compile_seconds = _compile(self.device)
         self._settings = self.config.imap
@@ -97,36 +95,39 @@ class Imap(Baseline):
 
     # -- the algorithm -------------------------------------------------------------------------------------------
 
-    def _step(
-        self, index: int, timestamp: float, rgb: np.ndarray, depth: np.ndarray, given: np.ndarray | None
-    ) -> FrameResult:
-        if self.config.tracking.use_given_poses and given is None:
-            raise InputError(f"frame {index}: tracking.use_given_poses is on, but step() got no T_world_camera")
+    def _step(self, frame: AdmittedFrame) -> FrameResult:
+        index, depth, given = frame.index, frame.depth, frame.given_pose
         scale = self._settings.scale
-        self._images.set(0, rgb, depth * np.float32(scale))
+        self._images.set(0, frame.rgb, depth * np.float32(scale))
         self._current = index
         timings: dict[str, float] = {}
         values: dict[str, float] = {}
-        inliers, depth_error = 1.0, 0.0
         first = not self._seen
         if first or self.config.tracking.use_given_poses:
-            vector = vector_from_pose(np.eye(4) if given is None else given)
+            located = Located(np.eye(4) if given is None else given)
         else:
             start = time.perf_counter()
-            vector, loss, depth_error, inliers = self._track(index)
-            values["tracking"] = loss
+            located, values["tracking"] = self._track(index)
             timings["tracking"] = time.perf_counter() - start
-        self._append(vector, timestamp, "OK")
+        self.history.add(frame.timestamp, located)
         if first or index % self.config.mapping.every == 0:
             start = time.perf_counter()
             values["mapping"] = self._map(index, depth, first)
             synchronize(self.device)
             timings["mapping"] = time.perf_counter() - start
         if not self.keyframes or index - self.keyframes[-1].index >= self.config.keyframes.every:
-            image = self._images.add(rgb, depth * np.float32(scale))
-            self.keyframes.append(Keyframe(index, image, self._vectors[index].copy()))
-        T = pose_from_vector(vector)
-        return FrameResult(index, timestamp, T, "OK", values, inliers, depth_error, timings)
+            image = self._images.add(frame.rgb, depth * np.float32(scale))
+            self.keyframes.append(Keyframe(index, image, self.history.pose(index)))
+        return FrameResult(
+            index,
+            frame.timestamp,
+            self.history.pose(index),
+            located.status,
+            values,
+            located.inliers,
+            located.depth_error,
+            timings,
+        )
 
     def finish(self) -> dict[str, float]:
         """Map the last frame if it was not, then train on a doubled window. Returns the seconds by phase."""
@@ -136,7 +137,7 @@ class Imap(Baseline):
             return timings
         if self._mapped != index:
             start = time.perf_counter()
-            self._map(index, self._images.depth_image(0) / np.float32(settings.scale), first=False)
+            self._map(index, self._images.current_depth() / np.float32(settings.scale), first=False)
             timings["mapping"] = time.perf_counter() - start
         if self.config.mapping.color_refinement:
             start = time.perf_counter()
@@ -146,9 +147,9 @@ class Imap(Baseline):
             timings["refinement"] = time.perf_counter() - start
         return timings
 
-    def _track(self, index: int) -> tuple[np.ndarray, float, float, float]:
-        """Pose vector [m], mean loss, mean depth error [m] and share of the rays with depth that are kept."""
-        start = self._scaled(self._initial_vector())
+    def _track(self, index: int) -> tuple[Located, float]:
+        """The camera, and the mean loss; inliers are the share of the rays with depth that are kept."""
+        start = self._scaled(vector_from_pose(self.history.starts(self.config.tracking.constant_speed)[0]))
         settings, batch = self._settings, self._tracking
         iterations = settings.tracking_iterations
         decay = self.config.tracking.final_rate_factor ** np.linspace(0.0, 1.0, iterations)[:, None]
@@ -170,7 +171,7 @@ class Imap(Baseline):
         candidates = [vector for vector in candidates if np.isfinite(vector).all()]
         return min((self._judge(index, vector) for vector in candidates), key=lambda result: result[1])
 
-    def _judge(self, index: int, vector: np.ndarray) -> tuple[np.ndarray, float, float, float]:
+    def _judge(self, index: int, vector: np.ndarray) -> tuple[Located, float]:
         """`_track`'s result for a pose, on pixels that are the same for all of a frame's."""
         batch = self._tracking
         self._poses.begin(vector[None])
@@ -179,12 +180,13 @@ class Imap(Baseline):
         measured = batch.measured_depth.numpy()[: batch.count]
         inlier = batch.inlier.numpy()[: batch.count] != 0
         count = int(inlier.sum())
-        metres = self._scaled(vector, 1.0 / self._settings.scale)
+        pose = pose_from_vector(self._scaled(vector, 1.0 / self._settings.scale))
         if not count:
-            return metres, np.inf, np.inf, 0.0
+            return Located(pose, inliers=0.0, depth_error=np.inf), np.inf
         error = np.abs(measured - batch.depth.numpy()[: batch.count])[inlier].mean() / self._settings.scale
         loss = float(batch.loss.numpy()[0]) / count
-        return metres, loss if np.isfinite(loss) else np.inf, float(error), count / int((measured > 0).sum())
+        located = Located(pose, inliers=count / int((measured > 0).sum()), depth_error=float(error))
+        return located, loss if np.isfinite(loss) else np.inf
 
     def _tracking_loss(self, wanted: Wanted | None = None, tape: wp.Tape | None = None) -> None:
         config, batch, bound = self.config.tracking, self._tracking, self._bound
@@ -195,13 +197,6 @@ class Imap(Baseline):
         batch.evaluate(self.network, bound, wanted, tape, jitter=self.config.sampling.jitter)
         batch.choose_inliers(0.0)
         batch.tracking_loss(TRACKING_COLOR_WEIGHT)
-
-    def _initial_vector(self) -> np.ndarray:
-        """Constant speed (if on and known), else the last pose [m]."""
-        last = pose_from_vector(self._vectors[-1])
-        if self.config.tracking.constant_speed and self._status[-2:] == ["OK", "OK"]:
-            last = last @ np.linalg.inv(pose_from_vector(self._vectors[-2])) @ last
-        return vector_from_pose(last)
 
     def _map(self, index: int, depth: np.ndarray, first: bool) -> float:
         """Train on the frame and on keyframes; the mean loss a ray of the last iteration."""
@@ -248,8 +243,8 @@ class Imap(Baseline):
             *others, last = self.keyframes
             rng = np.random.default_rng([self.seed, _MAPPING, index, round_])
             chosen = [others[n] for n in rng.permutation(len(others))[: max(size - 2, 0)]] + [last]
-        vectors = [*(keyframe.pose for keyframe in chosen), self._vectors[index]]
-        poses = np.stack([self._scaled(vector) for vector in vectors]).astype(np.float32)
+        matrices = [*(keyframe.pose for keyframe in chosen), self.history.pose(index)]
+        poses = np.stack([self._scaled(vector_from_pose(T)) for T in matrices]).astype(np.float32)
         slots = [*self._images.bring([keyframe.image for keyframe in chosen]), 0]
         return wp.array(slots, dtype=int, device=self.device), wp.array(poses, dtype=float, device=self.device)
 
@@ -276,8 +271,7 @@ class Imap(Baseline):
         return np.concatenate([vector[:4], vector[4:] * (self._settings.scale if scale is None else scale)])
 
     def _view(self, seen: SeenDepth) -> ObservedView:
-        camera = self.intrinsics.strided(SEEN_STRIDE)
-        return ObservedView(seen.depth(), camera, pose_from_vector(self._vectors[seen.index]))
+        return seen.view(self.intrinsics, self.history.pose(seen.index))
 
     # -- what came out -------------------------------------------------------------------------------------------
 
@@ -315,15 +309,7 @@ class Imap(Baseline):
             parts.append(wanted(batch).numpy()[: batch.count].copy())
         return np.concatenate(parts) if parts else wanted(batch).numpy()[:0]
 
-    def mesh(self, voxel: float | None = None) -> trimesh.Trimesh:
-        """Coloured mesh of what the mapped frames saw, in the world frame.
-
-        Args:
-            voxel: Edge of a marching-cubes cell [m]; `MeshingConfig.voxel` by default.
-
-        Raises:
-            MeshError: nothing was seen, or there is no surface.
-        """
+    def _mesh(self, voxel: float | None) -> trimesh.Trimesh:
         config = self.config.meshing
         return extract_mesh(
             self,
@@ -365,50 +351,27 @@ class Imap(Baseline):
         np.clip(out.rgb, 0.0, 1.0, out=out.rgb)
         return out
 
-    def save(self, path: str | Path) -> None:
-        """Write network, trajectory and what was seen to one .npz file (no pickled code), for views and meshes."""
-        path = Path(path)
-        header = {"format": FORMAT, "seed": self.seed, "config": self.config.model_dump()}
-        header |= {"intrinsics": vars(self.intrinsics), "status": self._status}
-        arrays: dict[str, Any] = {
-            "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
-            "timestamps": np.array(self._timestamps),
-            "vectors": np.array(self._vectors).reshape(-1, 7),
-            "bounds": np.stack([self._low, self._high]),
-            "seen_frames": np.array([seen.index for seen in self._seen], np.int64),
-            "seen": np.array([seen.millimetres for seen in self._seen], np.uint16),
+    def _state(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        seen = [seen.millimetres for seen in self._seen]
+        camera = self.intrinsics.strided(SEEN_STRIDE)
+        arrays = {
+            # Until something is seen there is no bound.
+            "bounds": np.stack([self._low, self._high])[: 2 * bool(seen)],
+            "seen": np.array(seen, np.uint16).reshape(-1, camera.height, camera.width),
         }
         arrays |= {f"network:{name}": array for name, array in self.network.tensors().items()}
-        temporary = path.with_name(path.name + ".part")
-        with open(temporary, "wb") as file:
-            np.savez(file, **arrays)
-        os.replace(temporary, path)
+        return {"seen": [seen.index for seen in self._seen]}, arrays
 
-    @classmethod
-    def load(cls, path: str | Path, device: str | None = None) -> Imap:
-        """Read what `save` wrote, for views and meshes; images of keyframes are not in it.
-
-        Raises:
-            CheckpointError: the file is missing, damaged, or no network of iMAP*.
-        """
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-            header = json.loads(arrays["header"].tobytes())
-            if header["format"] != FORMAT:
-                raise CheckpointError(f"{path}: is no map of iMAP* of this version; run again with --method imap")
-            config = Config.model_validate(header["config"])
-            result = cls(Intrinsics(**header["intrinsics"]), config, device, header["seed"])
-            tensors = {name.split(":", 1)[1]: a for name, a in arrays.items() if name.startswith("network:")}
-            result.network = ImapNetwork(tensors, result._launcher)
-            result._timestamps = [float(t) for t in arrays["timestamps"]]
-            result._vectors, result._status = list(arrays["vectors"]), header["status"]
-            result._low, result._high = arrays["bounds"]
-            pairs = zip(arrays["seen_frames"], arrays["seen"], strict=True)
-            result._seen = [SeenDepth(int(index), millimetres) for index, millimetres in pairs]
-        except (OSError, KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise CheckpointError(f"{path}: can't be read as a map of iMAP* ({error}); use another copy") from error
-        return result
+    def _restore(self, state: StateFields) -> None:
+        camera = self.intrinsics.strided(SEEN_STRIDE)
+        frames = state.frames("seen", len(self.history))
+        depths = state.array("seen", np.uint16, (len(frames), camera.height, camera.width))
+        self._seen = [SeenDepth(index, millimetres) for index, millimetres in zip(frames, depths, strict=True)]
+        if frames:
+            self._low, self._high = state.array("bounds", np.float64, (2, 3)).copy()
+        shapes = imap_shapes().items()
+        tensors = {name: state.array(f"network:{name}", np.float32, shape) for name, shape in shapes}
+        self.network = ImapNetwork(tensors, self._launcher)
 
 
 def _compile(device: wp.Device) -> float:

@@ -6,31 +6,30 @@ holds a truncated distance (float32), a weight and a colour (uint16 each, three 
 
 from __future__ import annotations
 
-import os
 import time
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import trimesh
 
 from warpslam.baselines.base import Baseline
 from warpslam.camera import Intrinsics
 from warpslam.config import Config
-from warpslam.errors import CheckpointError, InputError, MeshError, MissingDependencyError
+from warpslam.errors import InputError, MeshError, MissingDependencyError
 from warpslam.field.rendering import RenderedImage
-from warpslam.frames import FrameResult
-from warpslam.poses import check_transform, vector_from_pose
+from warpslam.frames import AdmittedFrame, FrameResult
+from warpslam.poses import check_transform
+from warpslam.storage.state_file import StateFields, StateFormat
+from warpslam.trajectory import Located
 
-if TYPE_CHECKING:
-    import trimesh
-
-FORMAT = "warpslam-tsdf-1"
 BLOCK_VOXELS = 16
 BYTES_PER_VOXEL = 12
+_ATTRIBUTES = {"tsdf": (np.float32, 1), "weight": (np.uint16, 1), "color": (np.uint16, 3)}
+"""Type and channels of what a voxel holds."""
 _FIRST_CAPACITY = 2000  # blocks; Open3D allocates more as they are needed
 
 
@@ -57,6 +56,7 @@ class Tsdf(Baseline):
     """
 
     name = "tsdf"
+    form = StateFormat("warpslam-tsdf", 2, "the map of a run with --method tsdf")
 
     def __init__(
         self, intrinsics: Intrinsics, config: Config | None = None, device: str | None = None, seed: int = 0
@@ -69,7 +69,7 @@ class Tsdf(Baseline):
             device: "cpu" or "cuda:0"; by default the CPU, as the package's wheels come without CUDA.
             seed: Not used: fusion has no random choice.
         """
-        super().__init__(intrinsics, config if config is not None else Config(), seed)
+        super().__init__(intrinsics, config, device, seed)
         self._o3d = import_open3d()
         self.device = device or "cpu"
         core = self._o3d.core
@@ -83,24 +83,24 @@ class Tsdf(Baseline):
             raise InputError(f"device = {device!r}: Open3D can't use it ({error}); use cpu") from error
         self._camera = core.Tensor(intrinsics.matrix)
 
-    def _step(
-        self, index: int, timestamp: float, rgb: np.ndarray, depth: np.ndarray, given: np.ndarray | None
-    ) -> FrameResult:
-        if given is None:
-            return self._skip(index, timestamp, "no pose is given, and TSDF fusion can't track")
+    def _step(self, frame: AdmittedFrame) -> FrameResult:
+        if frame.given_pose is None:
+            return self._skip(replace(frame, fault="no pose is given, and TSDF fusion can't track"))
         start = time.perf_counter()
         for name in ("_surface", "_scene"):
             self.__dict__.pop(name, None)
         image = self._o3d.t.geometry.Image
-        depth_image, rgb_image = image(self._tensor(depth)), image(self._tensor(rgb.astype(np.float32) / 255.0))
+        depth_image = image(self._tensor(frame.depth))
+        rgb_image = image(self._tensor(frame.rgb.astype(np.float32) / 255.0))
         # Open3D wants cameras on the CPU, whatever the device of the volume.
-        extrinsic = self._o3d.core.Tensor(np.linalg.inv(given))
+        extrinsic = self._o3d.core.Tensor(np.linalg.inv(frame.given_pose))
         limits = (1.0, self.config.grid.max_depth, self.config.tsdf.truncation_voxels)
         with self._quiet():
             blocks = self._grid.compute_unique_block_coordinates(depth_image, self._camera, extrinsic, *limits)
             self._grid.integrate(blocks, depth_image, rgb_image, self._camera, self._camera, extrinsic, *limits)
-        self._append(vector_from_pose(given), timestamp, "OK")
-        return FrameResult(index, timestamp, given, timings={"mapping": time.perf_counter() - start})
+        self.history.add(frame.timestamp, Located(frame.given_pose))
+        timings = {"mapping": time.perf_counter() - start}
+        return FrameResult(frame.index, frame.timestamp, frame.given_pose, timings=timings)
 
     def finish(self) -> dict[str, float]:
         """Nothing is left to do."""
@@ -120,18 +120,8 @@ class Tsdf(Baseline):
     def flops_per_point(self) -> None:
         """None: the map is looked up."""
 
-    def mesh(self, voxel: float | None = None) -> trimesh.Trimesh:
-        """Coloured zero crossing of the distance, in the world frame.
-
-        Args:
-            voxel: Must be that of the volume, or None: the mesh has no other resolution.
-
-        Raises:
-            MeshError: there is no surface.
-            InputError: another voxel is asked for.
-        """
-        import trimesh
-
+    def _mesh(self, voxel: float | None) -> trimesh.Trimesh:
+        """Zero crossing of the distance; the mesh has no other resolution than the volume."""
         if voxel is not None and voxel != self.config.tsdf.voxel:
             raise InputError(f"voxel = {voxel}: the volume has {self.config.tsdf.voxel} m; run with --set tsdf.voxel")
         vertices, faces, colors = self._surface
@@ -191,49 +181,20 @@ class Tsdf(Baseline):
         scene.add_triangles(core.Tensor(vertices), core.Tensor(faces.astype(np.uint32)))
         return scene
 
-    def save(self, path: str | Path) -> None:
-        """Write the volume and the trajectory to one .npz file (no pickled code)."""
-        path = Path(path)
+    def _state(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         keys, rows = self._active()
-        arrays = {name: self._grid.attribute(name)[rows].cpu().numpy() for name in ("tsdf", "weight", "color")}
-        temporary = path.with_name(path.name + ".part")
-        with open(temporary, "wb") as file:
-            np.savez_compressed(
-                file,
-                format=np.array(FORMAT),
-                config=np.array(self.config.model_dump_json()),
-                intrinsics=np.array(list(vars(self.intrinsics).values())),
-                keys=keys.cpu().numpy(),
-                timestamps=np.array(self._timestamps),
-                vectors=np.array(self._vectors).reshape(-1, 7),
-                status=np.array(self._status, dtype=str),
-                **arrays,
-            )
-        os.replace(temporary, path)
+        arrays = {name: self._grid.attribute(name)[rows].cpu().numpy() for name in _ATTRIBUTES}
+        return {}, {"keys": keys.cpu().numpy(), **arrays}
 
-    @classmethod
-    def load(cls, path: str | Path, device: str | None = None) -> Tsdf:
-        """Read what `save` wrote; the result goes on from the last frame.
-
-        Raises:
-            CheckpointError: the file is missing, damaged, or no TSDF volume.
-        """
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-            if str(arrays.get("format")) != FORMAT:
-                raise CheckpointError(f"{path}: is no TSDF volume of this version; run again with --method tsdf")
-            fx, fy, cx, cy, width, height = arrays["intrinsics"].tolist()
-            config = Config.model_validate_json(str(arrays["config"]))
-            tsdf = cls(Intrinsics(fx, fy, cx, cy, int(width), int(height)), config, device)
-            tsdf._timestamps = [float(t) for t in arrays["timestamps"]]
-            tsdf._vectors, tsdf._status = list(arrays["vectors"]), [str(s) for s in arrays["status"]]
-            if len(arrays["keys"]):
-                values = [tsdf._tensor(arrays[name]) for name in ("tsdf", "weight", "color")]
-                tsdf._grid.hashmap().insert(tsdf._tensor(arrays["keys"]), values)
-        except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise CheckpointError(f"{path}: can't be read as a TSDF volume ({error}); use another copy") from error
-        return tsdf
+    def _restore(self, state: StateFields) -> None:
+        keys = state.array("keys", np.int32, (None, 3))
+        edge = BLOCK_VOXELS
+        values = [
+            state.array(name, dtype, (len(keys), edge, edge, edge, channels))
+            for name, (dtype, channels) in _ATTRIBUTES.items()
+        ]
+        if len(keys):
+            self._grid.hashmap().insert(self._tensor(keys), [self._tensor(array) for array in values])
 
     def _active(self) -> tuple[Any, Any]:
         """Coordinates of the allocated blocks, and their rows in the attributes."""

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from warpslam.errors import DatasetError
+from warpslam.frames import FrameStatus
 from warpslam.runs.folder import RunFolder
 from warpslam.runs.metrics import RunMetrics
-from warpslam.runs.record import LOST, OK, SKIPPED
 from warpslam.storage.json_files import read_json
 from warpslam.storage.tum import read_tum
 
@@ -66,7 +66,7 @@ def gap_figures(folder: RunFolder) -> dict[str, float]:
     statuses = _statuses(folder.frames)
     if len(statuses) != len(times):
         raise DatasetError(f"{folder.frames}: has {len(statuses)} frames, and {folder.trajectory.name} {len(times)}")
-    usable = np.flatnonzero(statuses != SKIPPED)
+    usable = np.flatnonzero(statuses != FrameStatus.SKIPPED)
     steps = np.diff(times[usable])
     if len(steps) < 2 or steps.max() < MIN_GAP * np.median(steps):
         raise DatasetError(f"{folder.path}: no gap: no time without a usable frame stands out")
@@ -74,7 +74,7 @@ def gap_figures(folder: RunFolder) -> dict[str, float]:
     known = {round(time, 4): pose for time, pose in zip(truth_times, truth, strict=True)}
     true_pose = np.array([known.get(round(times[i], 4), np.full((4, 4), np.nan)) for i in usable])
     is_known = np.isfinite(true_pose).all(axis=(1, 2))
-    reference = np.flatnonzero(is_before & is_known & (statuses[usable] == OK))
+    reference = np.flatnonzero(is_before & is_known & (statuses[usable] == FrameStatus.OK))
     after = ~is_before & is_known
     if not len(reference) or not after.any():
         raise DatasetError(f"{folder.path}: no true pose is known of a frame before the gap and one after it")
@@ -82,7 +82,7 @@ def gap_figures(folder: RunFolder) -> dict[str, float]:
     T = true_pose[reference[-1]] @ np.linalg.inv(poses[usable[reference[-1]]])
     aligned = poses[usable][after][:, :3, 3] @ T[:3, :3].T + T[:3, 3]
     errors = np.linalg.norm(aligned - true_pose[after][:, :3, 3], axis=1)
-    lost = statuses[usable][~is_before] == LOST
+    lost = statuses[usable][~is_before] == FrameStatus.LOST
     return {"after_gap": 100 * float(np.sqrt((errors**2).mean())), "lost_after_gap": 100 * float(lost.mean())}
 
 

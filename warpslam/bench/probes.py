@@ -15,13 +15,12 @@ from warpslam.batch.jobs import Job
 from warpslam.errors import ConfigError, DatasetError
 from warpslam.field.decoder_files import load_decoders
 from warpslam.field.rendering import render_image
-from warpslam.frames import read_images
+from warpslam.frames import FrameStatus, read_images
 from warpslam.mapping.frustum import measured_extent, select_in_frustum
 from warpslam.mapping.mapper import Mapper
 from warpslam.pipeline.setup import load_kernels, open_source, select_frames
-from warpslam.poses import vector_from_pose
+from warpslam.poses import orthonormalized
 from warpslam.runs.given_poses import GivenPoses
-from warpslam.runs.record import OK
 from warpslam.scene.feature_grid import FeatureGrid
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.scene_map import SceneMap
@@ -94,7 +93,7 @@ def convergence(job: Job) -> dict[str, Any]:
         curve.append([iteration + 1, error])
 
     note(None, -1, mapping.first_iterations)
-    mapper.map_first(images, 0, vector_from_pose(T_world_camera), note)
+    mapper.map_first(images, 0, orthonormalized(T_world_camera), note)
     return {"figures": {"view_depth": curve[-1][1]}, "curve": curve}
 
 
@@ -118,18 +117,18 @@ def outside_change(job: Job) -> dict[str, Any]:
     def snapshot(level: str) -> FeatureGrid:
         grid = slam.scene.grids[level]
         copy = FeatureGrid(level, grid.spacing, grid.std, slam.seed, device)
-        copy.restore(grid.first, grid.shape, grid.features.numpy(), grid.seen.numpy())
+        copy.restore(grid.state())
         return copy
 
     for number, (frame, T_world_camera) in enumerate(islice(frames, 1 + MAPPING_CALLS * every)):
         before = {} if number == 0 else {level: snapshot(level) for level in levels}
         result = slam.step(frame.rgb, frame.depth, frame.timestamp, T_world_camera)
         slam.wait()
-        if number % every or number == 0 or result.status != OK:
+        if number % every or number == 0 or result.status != FrameStatus.OK:
             continue
         # The depth as the mapper has it, rounded.
         images.set(0, *read_images(frame.rgb, frame.depth, camera, config.grid.max_depth, None))
-        depth = wp.array(images.depth_image(0), dtype=float, device=device)
+        depth = images.metres()
         for level, old in before.items():
             grid = slam.scene.grids[level]
             old.update_from(grid, None)

@@ -19,6 +19,7 @@ from warpslam.cli.common import (
     EXIT_INTERRUPTED,
     add_command,
     add_config_option,
+    add_format_options,
     add_method_option,
     add_run_options,
     parse_frames,
@@ -45,8 +46,7 @@ def add(commands: Any) -> None:
     batch.add_argument("--workers", type=int, metavar="N", help="sequences at a time (1; on a cluster: what fits)")
     batch.add_argument("--memory-gb", type=float, metavar="GB", help="stop a worker that takes more memory than this")
     batch.add_argument("--cluster", metavar="ADDRESS", help="run on Ray: ray://HOST:10001, or local")
-    batch.add_argument("--dataset", default="auto", help="format of the folders (default: told from their file names)")
-    batch.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
+    add_format_options(batch)
     batch.add_argument("--preset", help="settings to start from (default: each dataset's)")
     add_config_option(batch)
     batch.add_argument("--frames", type=parse_frames, metavar="A:B:STEP", help="frames to use")

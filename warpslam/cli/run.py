@@ -24,11 +24,15 @@ from warpslam.cli.common import (
     warnings_on_stderr,
 )
 from warpslam.errors import ConfigError
+from warpslam.frames import FrameStatus
+from warpslam.pipeline.checkpoints import read_checkpoint
 from warpslam.pipeline.observer import Observer
+from warpslam.pipeline.run import run
 from warpslam.report.text import duration
 from warpslam.runs.folder import RunFolder
-from warpslam.runs.record import INTERRUPTED, LOST, OK, SKIPPED, UNREADABLE
+from warpslam.runs.record import INTERRUPTED
 from warpslam.runs.request import RunRequest, Source
+from warpslam.synthetic import demo
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -41,28 +45,30 @@ _PLAIN_LINES = 20
 
 def add(commands: Any) -> None:
     """Add both commands."""
-    run = add_command(commands, "run", _run, "trajectory and coloured mesh of a folder of RGB-D frames")
-    what = run.add_mutually_exclusive_group(required=True)
+    parser = add_command(commands, "run", _run, "trajectory and coloured mesh of a folder of RGB-D frames")
+    what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("folder", nargs="?", metavar="FOLDER", help="folder of one sequence")
     what.add_argument("--resume", metavar="RUN", help="go on with a run that was stopped, from its last checkpoint")
-    add_sequence_options(run)
-    add_config_option(run)
-    run.add_argument(
+    add_sequence_options(parser)
+    add_config_option(parser)
+    parser.add_argument(
         "--gt-mesh", "--truth-mesh", dest="truth_mesh", metavar="FILE", help="true surface, for reconstruction metrics"
     )
-    run.add_argument("--map", metavar="FILE", help="start from the map of another run (its folder, or the file)")
-    run.add_argument("--localize", action="store_true", help="with --map: only track the camera, leave the map alone")
-    run.add_argument("--no-check", action="store_true", help="run even if the checks of the input find an error")
-    add_method_option(run)
-    _add_poses_option(run)
-    _add_checkpoint_option(run)
-    add_run_options(run)
+    parser.add_argument("--map", metavar="FILE", help="start from the map of another run (its folder, or the file)")
+    parser.add_argument(
+        "--localize", action="store_true", help="with --map: only track the camera, leave the map alone"
+    )
+    parser.add_argument("--no-check", action="store_true", help="run even if the checks of the input find an error")
+    add_method_option(parser)
+    _add_poses_option(parser)
+    _add_checkpoint_option(parser)
+    add_run_options(parser)
 
-    demo = add_command(commands, "demo", _demo, "SLAM in a small rendered room; needs no data")
-    add_method_option(demo)
-    _add_poses_option(demo)
-    _add_checkpoint_option(demo)
-    add_run_options(demo)
+    parser = add_command(commands, "demo", _demo, "SLAM in a small rendered room; needs no data")
+    add_method_option(parser)
+    _add_poses_option(parser)
+    _add_checkpoint_option(parser)
+    add_run_options(parser)
 
 
 def _add_poses_option(parser: argparse.ArgumentParser) -> None:
@@ -101,8 +107,6 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from warpslam.synthetic import demo
-
     request = _common(options)
     request = replace(
         request,
@@ -115,8 +119,6 @@ def _demo(options: argparse.Namespace) -> int:
 
 def _resume(options: argparse.Namespace) -> int:
     """Everything is as the checkpoint says; an option that says otherwise is refused by the run."""
-    from warpslam.pipeline.checkpoints import read_checkpoint
-
     for name in ("preset", "config", "map", "localize", "output", "camera", "decoders"):
         if getattr(options, name):
             raise ConfigError(f"--{name} does not go with --resume: it is as when the run was started")
@@ -153,9 +155,6 @@ def _common(options: argparse.Namespace) -> RunRequest:
 
 
 def _execute(request: RunRequest, options: argparse.Namespace, **keywords: Any) -> int:
-    # Warp and torch, which no other part of the command line needs.
-    from warpslam.pipeline.run import run
-
     quiet_warp()
     with warnings_on_stderr(), _display() as display:
         result = run(request, options.output, observer=display, **keywords)
@@ -229,7 +228,7 @@ def _figures(progress: Progress) -> str:
     parts = [f"{progress.fps:.2f} fps", *(f"{name} {value:.3g}" for name, value in result.losses.items())]
     if progress.ate_rmse is not None:
         parts.append(f"ATE {100 * progress.ate_rmse:.2f} cm")
-    if result.status != OK:
+    if result.status != FrameStatus.OK:
         parts.append(result.status)
     return "  ".join(parts)
 
@@ -237,9 +236,7 @@ def _figures(progress: Progress) -> str:
 def _print_summary(result: RunResult) -> None:
     metrics = result.metrics
     frames, seconds = metrics.frames, metrics.seconds
-    counts = ", ".join(
-        f"{count} {name}" for name in (OK, LOST, SKIPPED, UNREADABLE) if (count := getattr(frames, name))
-    )
+    counts = ", ".join(f"{count} {name}" for name, count in frames.by_status)
     print(f"frames      {frames.processed} of {frames.selected} ({counts or 'none'}), {result.status}")
     fps = f", {metrics.fps:.2f} frames/s" if metrics.fps else ""
     print(f"time        {duration(seconds.run)}{fps}; compiling kernels {duration(seconds.kernel_compile)}")

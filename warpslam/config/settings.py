@@ -5,6 +5,7 @@ Defaults are the published ones for Replica (released code; paper A.6) where not
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,6 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from warpslam.config.overrides import merge, parse_override
 from warpslam.config.presets import PRESETS
 from warpslam.errors import ConfigError
+
+_FOLLOW_GIVEN_POSES = ("bundle_adjustment", "depth_start")  # of the mapping group, see `Config.resolved`
 
 
 class _Group(BaseModel):
@@ -269,7 +272,7 @@ class Config(_Group):
         """Validate a nested dictionary.
 
         Raises:
-            ConfigError: names each field that does not fit and the accepted range.
+            ConfigError: Names each field that does not fit and the accepted range.
         """
         try:
             return cls.model_validate(values)
@@ -278,29 +281,59 @@ class Config(_Group):
             raise ConfigError(f"{source}: " + "; ".join(lines)) from None
 
     @classmethod
-    def from_preset(cls, name: str = "default", overrides: list[str] | None = None) -> Config:
+    def from_preset(cls, name: str = "default", overrides: Sequence[str] | None = None) -> Config:
         """Settings of a preset with ``overrides`` of the form ``group.field=value`` on top.
 
         Raises:
-            ConfigError: unknown preset, malformed override, or a value out of range.
+            ConfigError: Unknown preset, malformed override, or a value out of range.
         """
         if name not in PRESETS:
             raise ConfigError(f"preset {name!r} is unknown; choose one of {', '.join(sorted(PRESETS))}")
-        values: dict[str, Any] = {}
-        for part in (PRESETS[name], *map(parse_override, overrides or [])):
-            merge(values, part)
+        values = _merged({}, PRESETS[name], *map(parse_override, overrides or []))
         return cls.from_dict(values, source=f"preset {name}")
 
-    def updated(self, overrides: list[str]) -> Config:
-        """These settings with overrides of the form ``group.field=value``.
+    @classmethod
+    def from_file(cls, path: str | Path, overrides: Sequence[str] | None = None) -> Config:
+        """Settings of a yaml file, such as a run's config.yaml or what ``warpslam info --preset`` prints, with
+        ``overrides`` of the form ``group.field=value`` on top. What the file leaves out is at its default.
 
         Raises:
-            ConfigError: malformed override, or a value out of range.
+            ConfigError: The file can't be read, is no yaml mapping, an override is malformed, or a value does not fit.
         """
-        values = self.model_dump()
+        return cls.load(path).updated(overrides or [])
+
+    def updated(self, overrides: Sequence[str]) -> Config:
+        """These settings with overrides of the form ``group.field=value``.
+
+        What `resolved` derived from given poses does not outlive them: without them it is back at its default, unless
+        an override says otherwise.
+
+        Raises:
+            ConfigError: Malformed override, or a value out of range.
+        """
+        changes: dict[str, Any] = {}
         for override in overrides:
-            merge(values, parse_override(override))
-        return self.from_dict(values)
+            merge(changes, parse_override(override))
+        values = self.model_dump()
+        if self.tracking.use_given_poses:
+            derived = {name: MappingConfig.model_fields[name].default for name in _FOLLOW_GIVEN_POSES}
+            tracked = Config.from_dict(_merged(values, changes)).tracking
+            if not tracked.use_given_poses:
+                merge(values, {"mapping": derived})
+        return self.from_dict(_merged(values, changes))
+
+    def resolved(self) -> Config:
+        """These settings with all that follows from others written out: what a `Slam` runs with.
+
+        Poses that are given stay as they are and can be believed, so there is no bundle adjustment, and new features
+        start from the measured depth unless that is off.
+        """
+        given, mapping = self.tracking.use_given_poses, self.mapping
+        derived = {
+            "bundle_adjustment": mapping.bundle_adjustment and not given,
+            "depth_start": given if mapping.depth_start is None else mapping.depth_start,
+        }
+        return self.model_copy(update={"mapping": mapping.model_copy(update=derived)})
 
     def with_files(self, decoders: str | None = None, poses: str | Path | None = None) -> Config:
         """These settings for a run that is given a decoder checkpoint, or a trajectory whose poses are taken as they
@@ -314,10 +347,10 @@ class Config(_Group):
         """Read settings from a yaml file.
 
         Raises:
-            ConfigError: the file can't be read, is no yaml mapping, or a value does not fit.
+            ConfigError: The file can't be read, is no yaml mapping, or a value does not fit.
         """
         try:
-            values = yaml.safe_load(Path(path).read_text())
+            values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
             raise ConfigError(f"{path}: can't be read as yaml: {error}") from None
         if not isinstance(values, dict):
@@ -325,5 +358,16 @@ class Config(_Group):
         return cls.from_dict(values, source=str(path))
 
     def save(self, path: str | Path) -> None:
-        """Write all settings as yaml."""
-        Path(path).write_text(yaml.safe_dump(self.model_dump(), sort_keys=False))
+        """Write all settings as yaml; `from_file` reads them."""
+        Path(path).write_text(self.to_yaml(), encoding="utf-8")
+
+    def to_yaml(self) -> str:
+        """All settings as yaml, group by group."""
+        return yaml.safe_dump(self.model_dump(), sort_keys=False)
+
+
+def _merged(*parts: dict[str, Any]) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for part in parts:
+        merge(values, part)
+    return values

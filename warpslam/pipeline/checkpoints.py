@@ -20,7 +20,7 @@ from warpslam.runs.record import RunRecord
 from warpslam.runs.request import RunRequest, SequenceFacts, Source, differences
 from warpslam.runtime.cores import slice_count
 from warpslam.slam import Slam
-from warpslam.slam_state import slam_from_state, slam_state
+from warpslam.slam_state import state_arrays, state_from_arrays
 from warpslam.storage.state_file import StateFormat, read_state, sync_folder, write_state
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ class SavedRun:
     """What had become of it by then."""
 
     state: tuple[dict[str, Any], dict[str, np.ndarray]]
-    """The SLAM object, as `warpslam.slam_state.slam_state` gives it."""
+    """The SLAM object, as `warpslam.slam_state.state_arrays` gives it."""
 
     @property
     def source(self) -> Source:
@@ -67,7 +67,8 @@ class SavedRun:
         Raises:
             CheckpointError: A field is damaged.
         """
-        slam = slam_from_state(self.path, *self.state, device=self.request.device, config=config)
+        state = state_from_arrays(self.path, *self.state, config=config)
+        slam = Slam.from_state(state, self.request.device)
         slam.config.mapping.enabled &= not self.request.localize_only
         if slam.config.schedule == "overlapped":
             log.warning(
@@ -159,7 +160,7 @@ def write_checkpoint(
     Raises:
         CheckpointError: The file can't be written.
     """
-    state, arrays = slam_state(slam)
+    state, arrays = state_arrays(slam.state())
     account, poses = record.to_state()
     header = {"slam": state, "run": {"request": request.to_dict(), "input": asdict(facts), "record": account}}
     new = folder.checkpoint.with_name("checkpoint.next.safetensors")

@@ -138,6 +138,7 @@ def extract_mesh(
         refinement_rounds: Rounds of the global refinement before that.
 
     Raises:
+        ConfigError: The method of the run has no refinement, or forecasts nothing.
         DatasetError: The run saved no map.
         InputError: The map can't be refined.
         MeshError: There is no surface, or the file can't be written.
@@ -148,8 +149,7 @@ def extract_mesh(
     slam = load_slam(folder, device)
     if refinement_rounds > 0:
         slam.refine(refinement_rounds)
-    settings: dict[str, Any] = {} if voxel is None else {"voxel": voxel}
-    mesh = slam.mesh(**settings, forecast=True) if forecast else slam.mesh(**settings)
+    mesh = slam.mesh(voxel, forecast=forecast)
     return mesh, write_mesh(mesh, path)
 
 

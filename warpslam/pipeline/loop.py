@@ -12,8 +12,9 @@ import numpy as np
 
 from warpslam.errors import DatasetError
 from warpslam.evaluation import ate
+from warpslam.frames import FrameStatus
 from warpslam.pipeline.results import trajectory_of
-from warpslam.runs.record import OK, SKIPPED, Progress
+from warpslam.runs.record import Progress
 
 if TYPE_CHECKING:
     from warpslam.frames import FrameResult
@@ -69,7 +70,7 @@ class FrameLoop:
                 frame.rgb, frame.depth, timestamp=frame.timestamp, T_world_camera=self._given_pose(frame, truth)
             )
             self.record.add(frame.index, truth, result)
-            level = logging.INFO if result.status == OK else logging.WARNING
+            level = logging.INFO if result.status == FrameStatus.OK else logging.WARNING
             log.log(level, "frame %d: %s", frame.index, _describe(result))
             fps = (len(self.record.results) - done_before) / max(time.perf_counter() - start, 1e-9)
             self.observer.frame(self._progress(result, fps))
@@ -114,7 +115,7 @@ class FrameLoop:
         name, results = self.sequence.name, self.record.results
         if not results:
             raise DatasetError(f"{name}: none of the {len(self.selected)} selected frames can be read")
-        if all(result.status == SKIPPED for result in results):
+        if all(result.status == FrameStatus.SKIPPED for result in results):
             raise DatasetError(f"{name}: none of the {len(results)} frames can be used: {results[-1].message}")
 
 

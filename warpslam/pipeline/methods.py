@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
@@ -26,12 +26,15 @@ METHODS = (DEFAULT_METHOD, "imap", "tsdf")
 class Method(Protocol):
     """A camera that moves through a scene, and the map it makes: `warpslam.slam.Slam` or a baseline.
 
-    device: Device that it computes on.
-    compile_seconds: Seconds spent on compiling kernels.
+    What a method can't do it refuses with a `ConfigError` that says so; see `warpslam.baselines.base.Baseline`.
     """
 
+    has_checkpoints: ClassVar[bool]
+    """Whether a run can be resumed from a checkpoint, and start from a map; one that can't starts again."""
     device: Any
+    """Device that it computes on."""
     compile_seconds: float
+    """Seconds spent on compiling kernels."""
 
     def step(
         self, rgb: Any, depth: Any, timestamp: float | None = None, T_world_camera: np.ndarray | None = None
@@ -52,8 +55,24 @@ class Method(Protocol):
         """View of the map from a pose."""
         ...
 
-    def mesh(self, voxel: float | None = None) -> trimesh.Trimesh:
-        """Coloured mesh in the world frame."""
+    def refine(self, rounds: int | None = None) -> None:
+        """More rounds of global refinement after `finish`.
+
+        Raises:
+            ConfigError: The method has none.
+        """
+        ...
+
+    def mesh(self, voxel: float | None = None, *, forecast: bool = False) -> trimesh.Trimesh:
+        """Coloured mesh in the world frame, with what the map suggests where nothing was seen if that is asked for.
+
+        Raises:
+            ConfigError: The method forecasts nothing.
+        """
+        ...
+
+    def inventory(self) -> dict[str, Any]:
+        """What the map holds, as further entries of metrics.json; empty where there is nothing to tell."""
         ...
 
     def save(self, path: str | Path) -> None:
@@ -75,9 +94,9 @@ def build_method(name: str, intrinsics: Intrinsics, config: Config, device: str 
     """A new method.
 
     Raises:
-        ConfigError: there is no method of this name.
-        CheckpointError: the decoders can't be loaded.
-        MissingDependencyError: the method needs an optional package that can't be loaded.
+        ConfigError: There is no method of this name.
+        CheckpointError: The decoders can't be loaded.
+        MissingDependencyError: The method needs an optional package that can't be loaded.
     """
     return _class_of(name)(intrinsics, config=config, device=device, seed=seed)
 
@@ -86,9 +105,9 @@ def load_method(name: str, path: Path, device: str | None) -> Method:
     """The method as ``save`` left it in a file.
 
     Raises:
-        ConfigError: there is no method of this name.
-        CheckpointError: the file can't be read.
-        MissingDependencyError: the method needs an optional package that can't be loaded.
+        ConfigError: There is no method of this name.
+        CheckpointError: The file can't be read.
+        MissingDependencyError: The method needs an optional package that can't be loaded.
     """
     return _class_of(name).load(path, device=device)
 
@@ -97,15 +116,19 @@ def check_method(name: str) -> None:
     """Whether there is a method of this name.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: There is none.
     """
     if name not in METHODS:
         raise ConfigError(f"method {name!r} is unknown; choose one of {', '.join(METHODS)}")
 
 
 def has_checkpoints(name: str) -> bool:
-    """Whether a run of this method can be resumed from a checkpoint; one that can't starts again."""
-    return name == DEFAULT_METHOD
+    """Whether a run of this method can be resumed from a checkpoint, and start from a map.
+
+    Raises:
+        ConfigError: There is no method of this name.
+    """
+    return _class_of(name).has_checkpoints
 
 
 def _class_of(name: str) -> Any:

@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from warpslam import __version__
-from warpslam.runs.record import SKIPPED, UNREADABLE, RunRecord
+from warpslam.frames import FrameStatus
+from warpslam.runs.record import UNREADABLE, RunRecord
 from warpslam.runtime.environment import package_versions, peak_memory_mib
 from warpslam.storage.json_files import write_json
 
@@ -45,8 +46,8 @@ def unusable_frames(record: RunRecord) -> list[dict[str, Any]]:
     """Frames that were left out or skipped, and why, in their order."""
     frames = [{"frame": f.index, "status": UNREADABLE, "reason": f.message} for f in record.left_out]
     for index, result in record.frames:
-        if result.status == SKIPPED:
-            frames.append({"frame": index, "status": SKIPPED, "reason": result.message})
+        if result.status == FrameStatus.SKIPPED:
+            frames.append({"frame": index, "status": FrameStatus.SKIPPED, "reason": result.message})
     return sorted(frames, key=lambda frame: frame["frame"])
 
 

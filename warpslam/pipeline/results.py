@@ -24,8 +24,6 @@ from warpslam.evaluation import (
 from warpslam.meshing import write_mesh
 from warpslam.report.plots import plot_error, plot_panels, plot_top_view
 from warpslam.runs.panels import Panel, save_panels
-from warpslam.scene.inventory import take_inventory
-from warpslam.slam import Slam
 from warpslam.storage.tum import write_tum
 
 if TYPE_CHECKING:
@@ -100,9 +98,8 @@ def write_map(folder: RunFolder, slam: Method, record: RunRecord, metrics: RunMe
     with record.clock("saving"):
         slam.save(folder.map)
     metrics.fill({"map": {"bytes": slam.map_bytes, "flops_per_point": slam.flops_per_point}})
-    if isinstance(slam, Slam):
-        with record.clock("inventory"):
-            metrics.fill({**take_inventory(slam), "memory": slam.memory()})
+    with record.clock("inventory"):
+        metrics.fill(slam.inventory())
 
 
 def extract_and_write_mesh(folder: RunFolder, slam: Method, record: RunRecord, metrics: RunMetrics) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from warpslam.frames import FrameStatus
 from warpslam.report import charts
 from warpslam.report.data import RunData
 from warpslam.report.page import Html, element, figures, join, legend, missing, section, table
 from warpslam.report.text import cubic_metres, duration, megabytes, percent
-from warpslam.runs.record import LOST, OK, SKIPPED, UNREADABLE
+from warpslam.runs.record import UNREADABLE
 
 MAX_LISTED = 100
 
@@ -105,32 +106,29 @@ def memory_section(run: RunData) -> Html:
 def frames_section(run: RunData) -> Html:
     """What became of the frames, and why some are not OK."""
     title = "Frames"
-    names = status_counts(run)
+    names = run.metrics.frames.by_status
     if not names:
         return section("frames", title, missing("No frame was processed."))
     content: list[Html] = [
         charts.share_bar("Frames by status", [(name, f"{count} {name}", count) for name, count in names]),
         legend(*((name, f"{count} {name}") for name, count in names)),
     ]
-    bad = [(index, result.status, result.message or "–") for index, result in run.record.frames if result.status != OK]
-    bad += [(frame.index, UNREADABLE, frame.message) for frame in run.record.left_out]
+    record = run.record
+    bad = [
+        (n, str(result.status), result.message or "–") for n, result in record.frames if result.status != FrameStatus.OK
+    ]
+    bad += [(frame.index, UNREADABLE, frame.message) for frame in record.left_out]
     rows = [[str(index), status, message] for index, status, message in sorted(bad)]
     if rows:
         content.append(table(("frame", "status", "why"), rows[:MAX_LISTED], "reasons"))
         if len(rows) > MAX_LISTED:
             rest = f"{len(rows) - MAX_LISTED} more are in {run.folder.frame_records.name}."
             content.append(element("p", rest, class_="missing"))
-    elif not run.record.frames:
+    elif not record.frames:
         content.append(missing("The run did not record why frames were lost or skipped."))
     else:
         content.append(element("p", "Every frame was tracked."))
     return section("frames", title, content)
-
-
-def status_counts(run: RunData) -> list[tuple[str, int]]:
-    """Status and number of frames, for each that there are any of."""
-    counts = run.metrics.frames
-    return [(name, count) for name in (OK, LOST, SKIPPED, UNREADABLE) if (count := getattr(counts, name))]
 
 
 def settings_section(run: RunData) -> Html:

@@ -10,11 +10,12 @@ import numpy as np
 
 from warpslam.errors import DatasetError
 from warpslam.evaluation import AteResult, ate
+from warpslam.frames import FrameStatus
 from warpslam.report.plots import top_view_axes
 from warpslam.runs.folder import RunFolder
 from warpslam.runs.metrics import RunMetrics
 from warpslam.runs.panels import Panel, load_panels
-from warpslam.runs.record import OK, RunRecord
+from warpslam.runs.record import RunRecord
 from warpslam.runs.request import Source
 from warpslam.storage.json_files import read_json
 from warpslam.storage.tum import associate, read_tum
@@ -86,9 +87,9 @@ class RunData:
         return self.metrics.sequence or self.folder.path.name
 
     @property
-    def statuses(self) -> list[str]:
+    def statuses(self) -> list[FrameStatus]:
         """Status of each pose; OK where the run did not record it."""
-        return self.record.statuses or [OK] * len(self.poses)
+        return self.record.statuses or [FrameStatus.OK] * len(self.poses)
 
     @property
     def frame_indices(self) -> list[int]:

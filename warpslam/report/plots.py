@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from warpslam.frames import FrameStatus
 from warpslam.runs.panels import Panel
-from warpslam.runs.record import OK
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,7 +20,7 @@ _TRUTH_COLOR, _ESTIMATE_COLOR, _TROUBLE_COLOR = "0.55", "tab:blue", "tab:red"
 _DEPTH_DIFFERENCE = 0.1  # [m], ends of the colour scale
 
 
-def plot_top_view(path: str | Path, poses: np.ndarray, truth: np.ndarray | None, status: list[str]) -> None:
+def plot_top_view(path: str | Path, poses: np.ndarray, truth: np.ndarray | None, status: Sequence[str]) -> None:
     """Draw the camera path from above, over the ground truth where there is one.
 
     Args:
@@ -36,7 +37,7 @@ def plot_top_view(path: str | Path, poses: np.ndarray, truth: np.ndarray | None,
     position = poses[:, :3, 3]
     axes.plot(position[:, across], position[:, along], color=_ESTIMATE_COLOR, linewidth=1.2, label="estimate")
     axes.plot(*position[0, [across, along]], "o", color=_ESTIMATE_COLOR, label="start")
-    trouble = np.array([s != OK for s in status])
+    trouble = np.array([s != FrameStatus.OK for s in status])
     if trouble.any():
         axes.plot(*position[trouble][:, [across, along]].T, "x", color=_TROUBLE_COLOR, label="lost or skipped")
     axes.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[along]} [m]", title="Camera path from above")
@@ -59,7 +60,7 @@ def plot_error(
     timestamps: np.ndarray,
     error: AteResult | None,
     losses: dict[str, np.ndarray],
-    status: list[str],
+    status: Sequence[str],
 ) -> None:
     """Draw the position error over time, or the tracking losses where there is no ground truth.
 
@@ -85,7 +86,7 @@ def plot_error(
         axes.set(ylabel="loss", title="Tracking losses (no ground truth)")
         if losses:
             axes.set_yscale("log")
-    for number, time in enumerate(elapsed[[s != OK for s in status]]):
+    for number, time in enumerate(elapsed[[s != FrameStatus.OK for s in status]]):
         axes.axvline(time, color=_TROUBLE_COLOR, alpha=0.3, label="lost or skipped" if number == 0 else None)
     axes.set_xlabel("time [s]")
     axes.grid(alpha=0.3)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
 import numpy as np
 
 from warpslam.errors import MeshError
 from warpslam.evaluation import depth_l1, load_mesh, psnr
+from warpslam.frames import FrameStatus
 from warpslam.report import charts
 from warpslam.report.accounts import (
     frames_section,
     memory_section,
     settings_section,
-    status_counts,
     timing_section,
     versions_section,
 )
@@ -21,7 +22,6 @@ from warpslam.report.data import RunData, axis_name, upright_axes
 from warpslam.report.page import Html, element, figures, join, legend, missing, page, section, table, void
 from warpslam.report.pictures import VIEW_HEIGHT, VIEW_WIDTH, MeshView, color_map, color_stops, data_uri, mesh_views
 from warpslam.report.text import centimetres, decibels, duration, number, percent
-from warpslam.runs.record import OK
 
 NO_TRUTH = "The sequence has no ground truth, so there is no error to measure."
 NO_POSES = "The run stopped before its first frame, so there is no trajectory."
@@ -75,7 +75,7 @@ def figures_section(run: RunData) -> Html:
     ate, fps, share = metrics.ate_m.aligned.rmse, metrics.fps, surface.completion_ratio_5cm
     no_surface = surface.error or metrics.mesh.error or "no true surface to compare with"
     frames, compiling = metrics.frames.processed, duration(metrics.seconds.kernel_compile) or "no time"
-    parts = [f"{count} {name}" for name, count in status_counts(run)]
+    parts = [f"{count} {name}" for name, count in metrics.frames.by_status]
     rows = [
         ("ATE RMSE", centimetres(ate), "after alignment" if ate is not None else "no ground truth"),
         ("Mesh accuracy", centimetres(surface.accuracy_m), "" if share else no_surface),
@@ -105,7 +105,7 @@ def trajectory_section(run: RunData) -> tuple[Html, np.ndarray | None]:
         lines.insert(0, ("truth", "ground truth", run.truth[:, :3, 3] @ axes[:2].T))
     points = [("start", f"start, frame {run.frame_indices[0]}", ground[0])]
     for position, status in enumerate(run.statuses):
-        if status != OK:
+        if status != FrameStatus.OK:
             points.append((status, f"frame {run.frame_indices[position]}: {status}", ground[position]))
     chart, pixels = charts.ground_chart(
         "Camera path from above", lines, axis_names=(axis_name(axes[0]), axis_name(axes[1])), points=points, cursor=True
@@ -113,7 +113,7 @@ def trajectory_section(run: RunData) -> tuple[Html, np.ndarray | None]:
     entries = [("estimate", "estimate"), ("start", "start")]
     if run.truth is not None:
         entries.insert(0, ("truth", "ground truth"))
-    entries += [(status, status) for status in sorted({*run.statuses} - {OK})]
+    entries += [(status, status) for status in sorted({*run.statuses} - {FrameStatus.OK})]
     length = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
     seconds = run.timestamps[-1] - run.timestamps[0]
     caption = f"Seen from above; the path is {length:.2f} m long and takes {duration(float(seconds))}."
@@ -146,7 +146,7 @@ def error_section(run: RunData) -> Html:
     marks = [
         (position, status, f"frame {run.frame_indices[position]}: {status}")
         for position, status in enumerate(run.statuses)
-        if status != OK
+        if status != FrameStatus.OK
     ]
     content = []
     if run.ate is None:
@@ -170,7 +170,7 @@ def error_section(run: RunData) -> Html:
     return section("error", "Error over time", content)
 
 
-def _tracking_charts(run: RunData, x: np.ndarray, marks: list[tuple[int, str, str]]) -> Html:
+def _tracking_charts(run: RunData, x: np.ndarray, marks: Sequence[tuple[int, str, str]]) -> Html:
     values = run.record.losses
     names = sorted(values, key=lambda name: (name != "tracking", name))
     losses = [(f"c{n % 6}", name, values[name]) for n, name in enumerate(names)]

@@ -13,6 +13,7 @@ from typing import Any, get_args
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from warpslam.errors import DatasetError
+from warpslam.frames import FrameStatus
 from warpslam.storage.json_files import read_json, to_json, write_json
 
 Number = float | None
@@ -37,6 +38,12 @@ class FrameCounts(_Part):
     OK: int | None = Field(None, description="frames whose pose was found")
     LOST: int | None = Field(None, description="frames whose pose was not found; they changed nothing in the map")
     SKIPPED: int | None = Field(None, description="frames that nothing could be told from")
+
+    @property
+    def by_status(self) -> list[tuple[str, int]]:
+        """Name and number of each kind that there are any of."""
+        names = (*map(str, FrameStatus), "unreadable")
+        return [(name, count) for name in names if (count := getattr(self, name))]
 
 
 class UnusableFrame(_Part):

@@ -11,20 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpslam.frames import FrameResult
+from warpslam.frames import FrameResult, FrameStatus
 
 if TYPE_CHECKING:
     from warpslam.evaluation import AteResult, ReconstructionResult
     from warpslam.runs.folder import RunFolder
     from warpslam.runs.metrics import RunMetrics
 
-OK, LOST, SKIPPED = "OK", "LOST", "SKIPPED"
 UNREADABLE = "unreadable"
 FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
 """How a run ended. After ctrl-C everything up to then is written."""
 
 # Beside its number in the sequence; the other fields of a result are in timing.json and trajectory.tum.
 _ROW_FIELDS = ("timestamp", "status", "message", "inliers", "depth_error", "losses")
+# A report says what a file has, even if that is no status of ours.
+_STATUSES = {str(status): status for status in FrameStatus}
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class RunRecord:
         return list(zip(self.frame_indices, self.results, strict=True))
 
     @property
-    def statuses(self) -> list[str]:
+    def statuses(self) -> list[FrameStatus]:
         """Status of each processed frame."""
         return [result.status for result in self.results]
 
@@ -95,13 +96,13 @@ class RunRecord:
         return {
             "processed": len(self.results),
             UNREADABLE: len(self.left_out),
-            **{status: counts.get(status, 0) for status in (OK, LOST, SKIPPED)},
+            **{status: counts.get(status, 0) for status in FrameStatus},
         }
 
     @property
     def usable(self) -> list[int]:
         """Positions of the processed frames that were not skipped."""
-        return [position for position, result in enumerate(self.results) if result.status != SKIPPED]
+        return [position for position, result in enumerate(self.results) if result.status != FrameStatus.SKIPPED]
 
     @property
     def truth(self) -> np.ndarray:
@@ -160,6 +161,7 @@ class RunRecord:
         truth = np.full((len(poses), 4, 4), np.nan) if truth is None else truth
         for position, (row, pose, true_pose) in enumerate(zip(content["frames"], poses, truth, strict=True)):
             values = {name: _known(row[name]) for name in _ROW_FIELDS}
+            values["status"] = _STATUSES.get(row["status"], row["status"])
             values["losses"] = {name: _known(value) for name, value in row["losses"].items()}
             record.add(row["index"], true_pose, FrameResult(index=position, T_world_camera=pose, **values))
         return record
@@ -196,7 +198,8 @@ class RunRecord:
             frame_indices=[int(index) for index in header["frame_indices"]],
             truth_poses=list(truth.reshape(-1, 4, 4)),
             results=[
-                FrameResult(T_world_camera=pose, **row) for pose, row in zip(poses, header["results"], strict=True)
+                FrameResult(T_world_camera=pose, **{**row, "status": FrameStatus(row["status"])})
+                for pose, row in zip(poses, header["results"], strict=True)
             ],
             left_out=[LeftOut(int(frame["index"]), str(frame["message"])) for frame in header["left_out"]],
             first_index=int(header["first_index"]),

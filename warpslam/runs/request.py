@@ -67,7 +67,7 @@ class RunRequest:
     """What is asked of a run.
 
     Settings are those of ``config``, or else of ``preset``, with ``overrides``, ``decoders`` and given ``poses`` on
-    top. A run starts with the request `resolved`: then ``config`` has all of that, and says it alone.
+    top. A run starts with the request `resolved`: then ``config`` has all of that, and what follows from it.
     """
 
     source: Source | None = None
@@ -140,7 +140,7 @@ class RunRequest:
         return replace(
             self,
             frames=(selected.start, selected.stop, selected.step),
-            config=self.settings(preset),
+            config=self.settings(preset).resolved(),
             preset=None,
             overrides=(),
             decoders=None,

@@ -19,13 +19,16 @@ import json
 import math
 import os
 import struct
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from warpslam.errors import CheckpointError
+from warpslam.errors import CheckpointError, ConfigError
+
+T = TypeVar("T")
 
 _DTYPES = {"U8": "<u1", "I8": "<i1", "U16": "<u2", "I32": "<i4", "I64": "<i8", "F32": "<f4", "F64": "<f8"}
 _NAMES = {np.dtype(code): name for name, code in _DTYPES.items()}
@@ -36,10 +39,14 @@ _MAX_TABLE_BYTES = 1 << 30
 
 @dataclass(frozen=True)
 class StateFormat:
-    """A kind of state file: its name and its version, a whole number that grows."""
+    """A kind of state file."""
 
     name: str
+    """What the file calls itself."""
     version: int
+    """A whole number that grows."""
+    origin: str = "what belongs here"
+    """Where such files come from, for who names one of another kind."""
 
 
 def write_state(path: Path, form: StateFormat, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> int:
@@ -109,7 +116,9 @@ def read_state(path: Path, form: StateFormat) -> tuple[dict[str, Any], dict[str,
     table, data = _open(path, content)
     metadata = table.pop(_METADATA)
     if metadata["format"] != form.name:
-        raise CheckpointError(f"{path}: field format is {metadata['format']!r}, expected {form.name!r}")
+        raise CheckpointError(
+            f"{path}: field format is {metadata['format']!r}, expected {form.name!r}: name {form.origin}"
+        )
     _check_version(path, metadata["version"], form)
     try:
         header = json.loads(metadata["header"])
@@ -189,13 +198,14 @@ def _bytes(array: np.ndarray) -> memoryview:
     return array.reshape(-1).data.cast("B") if array.size else memoryview(b"")
 
 
-class _Fields:
-    """Fields of a state, each checked when it is taken."""
+class StateFields:
+    """Fields of a state, each checked when it is taken: one that does not fit is a `CheckpointError` that names it."""
 
     def __init__(self, source: str, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
         self.source, self.header, self.arrays = source, header, arrays
 
     def damaged(self, name: str, why: object) -> CheckpointError:
+        """The error for a field that does not fit."""
         return CheckpointError(f"{self.source}: field {name} is missing or damaged ({why}): use another copy")
 
     def array(self, name: str, dtype: type, shape: tuple[int | None, ...]) -> np.ndarray:
@@ -211,22 +221,40 @@ class _Fields:
             raise self.damaged(name, "it holds NaN or infinity")
         return array
 
+    def texts(self, name: str, count: int, choices: Collection[str]) -> list[str]:
+        """``count`` words, each one of ``choices``."""
+        value = self.header.get(name)
+        if not isinstance(value, list) or len(value) != count or not all(word in choices for word in value):
+            raise self.damaged(name, f"expected {count} of {', '.join(choices)}")
+        return value
+
+    def parsed(self, name: str, parse: Callable[[dict[str, Any]], T]) -> T:
+        """What ``parse`` makes of a mapping."""
+        try:
+            return parse(self.mapping(name))
+        except (TypeError, ConfigError) as error:
+            raise self.damaged(name, error) from None
+
     def mapping(self, name: str) -> dict[str, Any]:
+        """Names and values."""
         value = self.header.get(name)
         if not isinstance(value, dict):
             raise self.damaged(name, f"expected a mapping, found {type(value).__name__}")
         return value
 
     def integer(self, name: str) -> int:
+        """A whole number from 0 on."""
         value = self.header.get(name)
         if type(value) is not int or value < 0:
             raise self.damaged(name, f"expected a whole number, found {value!r}")
         return value
 
     def frame(self, name: str, count: int) -> int | None:
+        """The number of one of ``count`` frames, or None."""
         return None if self.header.get(name) is None else self._below(name, self.header[name], count)
 
     def frames(self, name: str, count: int) -> list[int]:
+        """Numbers of some of ``count`` frames."""
         value = self.header.get(name)
         if not isinstance(value, list):
             raise self.damaged(name, f"expected a list, found {type(value).__name__}")
