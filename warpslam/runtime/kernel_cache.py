@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from warpslam.errors import ConfigError
-from warpslam.pipeline.log import log
+
+log = logging.getLogger(__name__)
 
 
 @contextmanager
