@@ -13,7 +13,6 @@ from warpslam.config import Config
 from warpslam.errors import CheckpointError, ConfigError, InputError
 from warpslam.field.decoder_files import load_decoders
 from warpslam.frames import read_images
-from warpslam.poses import pose_from_vector
 from warpslam.slam import Slam
 from warpslam.synthetic import SyntheticSequence
 
@@ -81,7 +80,7 @@ def test_tracking_recovers_a_small_motion(frames, device, optimizer):
     offset = np.eye(4)
     offset[:3, :3] = [[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]]
     offset[:3, 3] = [0.015, 0.01, -0.01]
-    result = slam._tracker.track(slam.scene.arrays(), slam._images, 1, truth @ offset)
+    result = slam.tracker.track(slam.scene.arrays(), slam.images, 1, truth @ offset)
     error = np.linalg.inv(truth) @ result.T_world_camera
     assert np.linalg.norm(error[:3, 3]) < 0.01
     assert np.degrees(np.arccos(np.clip((np.trace(error[:3, :3]) - 1) / 2, -1, 1))) < 0.5
@@ -108,7 +107,7 @@ def test_bundle_adjustment_writes_poses_back(frames):
     off = run(frames, "mapping.bundle_adjustment=false")
     assert not np.allclose(second.pose, off.keyframes[1].pose)
     for keyframe in slam.keyframes:
-        np.testing.assert_array_equal(slam._vectors[keyframe.index], keyframe.pose)
+        np.testing.assert_array_equal(slam.history.pose(keyframe.index), keyframe.pose)
 
 
 def test_keyframes_by_interval_and_by_information_gain(frames):
@@ -129,7 +128,7 @@ def test_given_poses_are_taken(frames):
     slam = run(frames[:3], "tracking.use_given_poses=true", *adjusted)
     truth = [f.T_world_camera for f in frames[:3]]
     np.testing.assert_allclose(slam.trajectory.poses, truth, atol=1e-6)
-    np.testing.assert_allclose([pose_from_vector(k.pose) for k in slam.keyframes], truth, atol=1e-6)
+    np.testing.assert_allclose([k.pose for k in slam.keyframes], truth, atol=1e-6)
     with pytest.raises(InputError, match="frame 3"):
         slam.step(frames[3].rgb, frames[3].depth)
 
@@ -137,14 +136,14 @@ def test_given_poses_are_taken(frames):
 def test_bundle_adjustment_is_no_motion(frames, monkeypatch):
     """A correction of the last pose moves the start of the next frame by as much, and not by twice as much."""
     slam = run(frames[:4])
-    track, starts = slam._tracker.track, []
-    monkeypatch.setattr(slam._tracker, "track", lambda *a, **k: starts.append(a[3]) or track(*a, **k))
-    vectors = [vector.copy() for vector in slam._vectors[-2:]]
-    before, last = (pose_from_vector(vector) for vector in vectors)
-    correction = np.array([0, 0, 0, 0, 0.05, 0, 0])
-    slam._write_back(3, vectors[1] + correction)
+    track, starts = slam.tracker.track, []
+    monkeypatch.setattr(slam.tracker, "track", lambda *a, **k: starts.append(a[3]) or track(*a, **k))
+    before, last = (slam.history.pose(n) for n in (2, 3))
+    corrected = last.copy()
+    corrected[0, 3] += 0.05
+    slam.history.correct(3, corrected)
     slam.step(frames[4].rgb, frames[4].depth)
-    expected = pose_from_vector(vectors[1] + correction) @ np.linalg.inv(before) @ last
+    expected = corrected @ np.linalg.inv(before) @ last
     np.testing.assert_allclose(starts[0], expected, atol=1e-6)
 
 
@@ -162,7 +161,7 @@ def test_tracking_goes_by_what_was_seen(frames):
         flags[int(share * len(flags)) :] = 0
         seen.assign(flags)
         result = slam.step(frames[1].rgb, frames[1].depth)
-        return int(slam._tracker._batch.keep.numpy().sum()), result.inliers, result.status
+        return int(slam.tracker._batch.keep.numpy().sum()), result.inliers, result.status
 
     whole, half, nothing = (next_result(slam, share) for share in (1.0, 0.5, 0.0))
     assert 0 < half[0] < 0.8 * whole[0]
@@ -189,7 +188,7 @@ def test_only_vertices_in_the_frustum_change(frames):
     slam = run(frames[:1], "mapping.coarse=false")
     grid = slam.scene.grids["middle"]
     before = grid.features.numpy().copy()
-    slam._mapper.map_frame(slam._images, 1, slam._vectors[0], slam.keyframes)
+    slam.mapper.map_frame(slam.images, 1, slam.history.pose(0), slam.keyframes)
     index = np.stack(np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij"), -1).reshape(-1, 3)
     camera = (grid.spacing * (grid.first + index) - frames[0].T_world_camera[:3, 3]) @ frames[0].T_world_camera[:3, :3]
     behind = (camera[:, 2] < 0) & (np.linalg.norm(camera, axis=1) > 0.5)

@@ -14,7 +14,7 @@ from warpslam.config import Config
 from warpslam.errors import CheckpointError, ConfigError, InputError, MapSizeError
 from warpslam.field.decoder_files import load_decoders
 from warpslam.slam import Slam
-from warpslam.slam_state import slam_from_state, slam_state
+from warpslam.slam_state import state_arrays, state_from_arrays
 from warpslam.synthetic import SyntheticSequence
 
 CAMERA = Intrinsics(40.0, 40.0, 23.5, 17.5, 48, 36)
@@ -50,13 +50,13 @@ def state(frames):
     slam.config.tracking.relocalization = False
     noise = np.random.default_rng(0).uniform(0.3, 9.0, frames[4].depth.shape).astype(np.float32)
     assert slam.step(frames[4].rgb, noise).status == "LOST"
-    return slam_state(slam)
+    return state_arrays(slam.state())
 
 
 def test_everything_comes_back(state):
     """The state of a loaded map is the state that was saved, to the last bit."""
     header, arrays = state
-    again_header, again = slam_state(slam_from_state("map", header, arrays, "cpu"))
+    again_header, again = state_arrays(Slam.from_state(state_from_arrays("map", header, arrays), "cpu").state())
     assert again_header == header and again.keys() == arrays.keys()
     for name, array in arrays.items():
         assert again[name].dtype == array.dtype, name
@@ -85,7 +85,7 @@ def test_every_array_is_needed_and_checked(state):
         for bad in damaged if not name.startswith("image_") else damaged[:2]:
             others = {**arrays, name: bad} if bad is not None else {n: a for n, a in arrays.items() if n != name}
             with pytest.raises(CheckpointError, match=name.split(":")[-1]):
-                slam_from_state("map", header, others, "cpu")
+                state_from_arrays("map", header, others)
 
 
 @pytest.mark.parametrize(
@@ -100,17 +100,17 @@ def test_every_header_field_is_checked(state, name, value):
     """A header field that can't be is named."""
     header, arrays = state
     with pytest.raises(CheckpointError, match=name):
-        slam_from_state("map", {**header, name: value}, arrays, "cpu")
+        state_from_arrays("map", {**header, name: value}, arrays)
     if value is None:
         with pytest.raises(CheckpointError, match=name):
-            slam_from_state("map", {n: v for n, v in header.items() if n != name}, arrays, "cpu")
+            state_from_arrays("map", {n: v for n, v in header.items() if n != name}, arrays)
 
 
 def test_image_that_does_not_inflate_is_refused(state):
     """Compressed images are looked into at load, not when a mapping call wants one."""
     header, arrays = state
     with pytest.raises(CheckpointError, match="image_1"):
-        slam_from_state("map", header, {**arrays, "image_1_rgb": np.arange(50, dtype=np.uint8)}, "cpu")
+        state_from_arrays("map", header, {**arrays, "image_1_rgb": np.arange(50, dtype=np.uint8)})
 
 
 @given(data=st.data())
@@ -171,7 +171,7 @@ def test_image_budget_changes_no_result(frames):
     """With room for just the images of two windows, the same poses and features come out as with room for all."""
     wide, tight = run(frames), run(frames, f"keyframes.max_gigabytes={7.5 * IMAGE_GIGABYTES}")
     wide.finish(), tight.finish()
-    assert len(tight.keyframes) > 7 == tight._images.rgb.shape[0]
+    assert len(tight.keyframes) > 7 == tight.images.rgb.shape[0]
     np.testing.assert_array_equal(tight.trajectory.poses, wide.trajectory.poses)
     for level, grid in wide.scene.grids.items():
         np.testing.assert_array_equal(tight.scene.grids[level].features.numpy(), grid.features.numpy())
@@ -187,13 +187,15 @@ def test_memory_report_adds_up(frames):
     """Bytes by part, and the observed volume: that of the cone before a wall."""
     slam = Slam(CAMERA, Config.from_preset("default", SETTINGS), "cpu", decoders=load_decoders())
     slam.step(frames[0].rgb, np.full((36, 48), 3.0, np.float32))
-    report = slam.memory()
+    inventory = slam.inventory()
+    report, observed = inventory["memory"], inventory["observed_volume_m3"]
     assert report["grid_bytes"] == sum(grid.features.capacity for grid in slam.scene.grids.values())
     parts = report["grid_bytes"] + report["keyframe_bytes"] + report["seen_bytes"]
     assert report["state_bytes"] == parts and report["seen_bytes"] == 2 * 9 * 12
     cone = 3.0**3 / 3 * (48 / 40) * (36 / 40)
-    assert report["observed_m3"] == pytest.approx(cone, rel=0.2)
-    assert report["state_bytes_per_observed_m3"] == pytest.approx(parts / report["observed_m3"])
+    # Cells at the border count whole.
+    assert cone < observed < 1.6 * cone
+    assert report["state_bytes_per_observed_m3"] == pytest.approx(parts / observed)
 
 
 @pytest.mark.slow
@@ -213,9 +215,9 @@ def test_memory_stays_flat_over_a_thousand_frames():
     for n in range(1000):
         frame = frames[n % len(frames)]
         slam.step(frame.rgb, frame.depth, T_world_camera=frame.T_world_camera)
-        slam._tracker.track(slam.scene.arrays(), slam._images, n, frame.T_world_camera)
+        slam.tracker.track(slam.scene.arrays(), slam.images, n, frame.T_world_camera)
         if n % 200 == 199:
-            used.append((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, slam.memory()["grid_bytes"]))
+            used.append((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, slam.inventory()["memory"]["grid_bytes"]))
     process, grids = zip(*used, strict=True)
     assert process[-1] - process[0] < 20 * 1024, f"the process grew: {process} KiB"
     assert grids[-1] == grids[0]

@@ -15,9 +15,7 @@ from warpslam.errors import ConfigError, InputError
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Pinhole intrinsics in pixels; pixel centres at integer coordinates (SPEC of the paper's code: no half-pixel
-    offset).
-    """
+    """Pinhole intrinsics in pixels; pixel centres lie at integer coordinates, as in the authors' released code."""
 
     fx: float
     fy: float

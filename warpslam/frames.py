@@ -1,25 +1,139 @@
-"""What may be wrong with one frame: arrays in, images that the map can take out, or the reason why the frame is no use.
+"""Frames at the door: what comes in, what may be wrong with it, and what is said of it afterwards.
 
 Misuse and bad data are told apart. Misuse is what holds for every call alike (no array, integer depth without its
-unit) and raises `InputError`; a bad frame is what a camera, a disk or a network can do to a single frame, and raises
-`FrameError`, which `Slam.step` turns into the status SKIPPED.
+unit) and raises `InputError`; a bad frame is what a camera, a disk or a network can do to a single frame, and is
+admitted with its fault, which `Slam.step` turns into the status SKIPPED.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
 
 from warpslam.camera import Intrinsics, check_number
-from warpslam.errors import FrameError, InputError
+from warpslam.config import Config
+from warpslam.errors import ConfigError, FrameError, InputError
+from warpslam.poses import check_transform, orthonormalized
 
 MIN_DEPTH_PIXELS = 100
 BLANK_SHARE = 0.99
 """An image is black or over-exposed if this share of its pixels is."""
 DARKEST, BRIGHTEST = 2, 253
+DEFAULT_RATE = 30.0
+"""Frames a second where no times are given."""
+
+
+class FrameStatus(StrEnum):
+    """What became of a frame."""
+
+    OK = "OK"
+    """Its pose is known."""
+    LOST = "LOST"
+    """Its pose was not found; the map is untouched."""
+    SKIPPED = "SKIPPED"
+    """There is nothing usable in it; the map is untouched."""
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """What `Slam.step` returns."""
+
+    index: int
+    """Frame number from 0."""
+    timestamp: float
+    """[s]."""
+    T_world_camera: np.ndarray
+    """Estimated pose, float64 (4, 4); of a frame that is not OK, that of the last one that was."""
+    status: FrameStatus = FrameStatus.OK
+    """OK, LOST or SKIPPED."""
+    losses: dict[str, float] = field(default_factory=dict)
+    """Mean loss per ray: "tracking", and of the stages of mapping that was done by then."""
+    inliers: float = 1.0
+    """Share of the depth rays into what the map has seen that agree with it, in [0, 1]."""
+    depth_error: float = 0.0
+    """Mean ``|measured - rendered depth|`` of the inliers [m]."""
+    timings: dict[str, float] = field(default_factory=dict)
+    """Seconds by phase: "tracking", "mapping" (overlapped: waiting for it and taking it over), "keyframe"."""
+    message: str = ""
+    """Why the frame is not OK."""
+
+
+@dataclass(frozen=True, eq=False)
+class AdmittedFrame:
+    """A frame in the form that the algorithm takes, or the reason why it is no use."""
+
+    index: int
+    """Frame number from 0."""
+    timestamp: float
+    """[s]; of a frame whose time is no number, that of the frame before."""
+    rgb: np.ndarray
+    """Colour, uint8 (H, W, 3); empty where there is a fault."""
+    depth: np.ndarray
+    """z-depth [m], float32 (H, W), 0 where nothing was measured; empty where there is a fault."""
+    given_pose: np.ndarray | None = None
+    """Known T_world_camera, float64 (4, 4)."""
+    fault: str = ""
+    """Why the frame can't be used; empty if it can."""
+
+
+def admit(
+    index: int,
+    rgb: Any,
+    depth: Any,
+    timestamp: float | None,
+    T_world_camera: np.ndarray | None,
+    *,
+    depth_scale: float | None,
+    last_timestamp: float,
+    intrinsics: Intrinsics,
+    config: Config,
+    colored: bool = True,
+) -> AdmittedFrame:
+    """Take in what was passed to `Slam.step`, whose arguments these are.
+
+    Args:
+        index: Frame number.
+        rgb: As in `Slam.step`.
+        depth: As in `Slam.step`.
+        timestamp: As in `Slam.step`.
+        T_world_camera: As in `Slam.step`.
+        depth_scale: As in `Slam.step`.
+        last_timestamp: Time of the frame before [s].
+        intrinsics: Camera, for the size that the images should have.
+        config: Settings.
+        colored: Whether colour is used; if not, a black image is no fault.
+
+    Raises:
+        InputError: Misuse, which no other frame would mend.
+    """
+    time = index / DEFAULT_RATE if timestamp is None else check_number(timestamp, "timestamp")
+    given = None if T_world_camera is None else check_transform(T_world_camera, unknown_is_nan=True)
+    needs_pose = config.tracking.use_given_poses
+    if needs_pose and given is None:
+        raise InputError(f"frame {index}: tracking.use_given_poses is on, but step() got no T_world_camera")
+    try:
+        rgb, depth = read_images(rgb, depth, intrinsics, config.grid.max_depth, depth_scale, colored=colored)
+        if not math.isfinite(time):
+            raise FrameError(f"its timestamp is {time}")
+        if given is not None and not np.isfinite(given).all():
+            if needs_pose:
+                raise FrameError("its T_world_camera holds NaN or infinity, and tracking.use_given_poses is on")
+            given = None
+    except FrameError as error:
+        time = time if math.isfinite(time) else last_timestamp
+        nothing = np.zeros((0, 0, 3), np.uint8), np.zeros((0, 0), np.float32)
+        return AdmittedFrame(index, time, *nothing, fault=str(error))
+    return AdmittedFrame(index, time, rgb, depth, None if given is None else orthonormalized(given))
+
+
+def skipped(frame: AdmittedFrame, last_pose: np.ndarray) -> FrameResult:
+    """What is said of a frame with a fault."""
+    status = FrameStatus.SKIPPED
+    return FrameResult(frame.index, frame.timestamp, last_pose.copy(), status, inliers=0.0, message=frame.fault)
 
 
 def read_images(
@@ -111,8 +225,10 @@ def _metres(depth: np.ndarray, depth_scale: float | None, max_depth: float) -> n
     elif not np.issubdtype(depth.dtype, np.floating):
         raise FrameError(f"depth has dtype {depth.dtype}, expected float [m] or uint16 with depth_scale")
     with np.errstate(over="ignore"):
-        depth = depth.astype(np.float32)
-    usable = np.isfinite(depth) & (depth > 0) & (depth <= max_depth)
+        depth = depth.astype(np.float32, copy=False)
+    usable = (depth > 0) & (depth <= max_depth)  # NaN is neither
+    if not math.isfinite(max_depth):
+        usable &= np.isfinite(depth)
     count = np.count_nonzero(usable)
     if count < MIN_DEPTH_PIXELS:
         within = f" within {max_depth:g} m" if math.isfinite(max_depth) else ""
@@ -120,26 +236,18 @@ def _metres(depth: np.ndarray, depth_scale: float | None, max_depth: float) -> n
     return np.where(usable, depth, np.float32(0.0))
 
 
-@dataclass(frozen=True)
-class FrameResult:
-    """What `Slam.step` returns.
+def check_settings(camera: Intrinsics, config: Config) -> None:
+    """Whether settings fit the camera and one another.
 
-    index: Frame number from 0. timestamp: [s].
-    T_world_camera: Estimated pose, float64 (4, 4); of a frame that is not OK, that of the last one that was.
-    status: "OK"; "LOST" (the pose was not found, the map is untouched); "SKIPPED" (nothing usable in the frame).
-    losses: Mean loss per ray: "tracking", and of the stages of mapping that was done by then.
-    inliers: Share of the depth rays into what the map has seen that agree with it, in [0, 1].
-    depth_error: Mean |measured - rendered depth| of the inliers [m].
-    timings: Seconds by phase: "tracking", "mapping" (overlapped: waiting for it and taking it over), "keyframe".
-    message: Why the frame is not OK.
+    Raises:
+        InputError: They leave nothing of an image.
+        ConfigError: They contradict one another.
     """
-
-    index: int
-    timestamp: float
-    T_world_camera: np.ndarray
-    status: str = "OK"
-    losses: dict[str, float] = field(default_factory=dict)
-    inliers: float = 1.0
-    depth_error: float = 0.0
-    timings: dict[str, float] = field(default_factory=dict)
-    message: str = ""
+    tracking = config.tracking
+    if camera.width <= 2 * tracking.ignore_edge_u or camera.height <= 2 * tracking.ignore_edge_v:
+        raise InputError(
+            f"tracking.ignore_edge_u = {tracking.ignore_edge_u} and ignore_edge_v = {tracking.ignore_edge_v} "
+            f"leave nothing of a {camera.width} x {camera.height} image: lower them"
+        )
+    if tracking.use_given_poses and config.keyframes.policy == "information_gain":
+        raise ConfigError("keyframes.policy = information_gain needs tracking; use interval with given poses")

@@ -31,6 +31,11 @@ def check_transform(T: np.ndarray, name: str = "T_world_camera", *, unknown_is_n
     return T
 
 
+def orthonormalized(T: np.ndarray) -> np.ndarray:
+    """A rigid transform (4, 4), float64, whose rotation is one to the last digits."""
+    return pose_from_vector(vector_from_pose(T))
+
+
 def vector_from_pose(T: np.ndarray) -> np.ndarray:
     """Pose vector (qw, qx, qy, qz, tx, ty, tz), float64, of a (4, 4) transform; the quaternion has unit length and
     qw >= 0.

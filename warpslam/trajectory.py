@@ -1,86 +1,257 @@
-"""The estimated camera trajectory."""
+"""The camera's trajectory: what came out of it, and the record of frames that it is taken from.
+
+A pose is ``T_world_camera``, float64 (4, 4), lengths in metres.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
 
-from warpslam.poses import motion_between, pose_from_vector
-
-
-@dataclass(frozen=True)
-class Trajectory:
-    """Poses of all frames so far.
-
-    timestamps: [s], float64 (N,). poses: T_world_camera, float64 (N, 4, 4). status: "OK", "LOST" or "SKIPPED" of each
-    frame.
-    """
-
-    timestamps: np.ndarray
-    poses: np.ndarray
-    status: list[str]
-
+from warpslam.frames import FrameStatus
+from warpslam.poses import motion_between
+from warpslam.storage.state_file import StateFields
 
 RECENT_FRAMES = 20
 STEP_FACTOR = 5.0  # a step beyond this multiple of the recent ones is a jump
 
 
 @dataclass(frozen=True)
-class Track:
-    """What is known of the camera's motion so far.
+class Trajectory:
+    """Poses of all frames so far."""
 
-    vectors: Pose vectors of all frames. status: Their status. depth_errors: Their mean depth errors [m].
-    motion: Of the last frame against the one before (4, 4), as it was tracked. The poses may say something else since:
-        bundle adjustment has moved one of them, and that is no motion of the camera.
-    first: Frame from which the camera has moved without a break; poses before it say nothing of where it is.
-    """
+    timestamps: np.ndarray
+    """[s], float64 (N,)."""
+    poses: np.ndarray
+    """T_world_camera, float64 (N, 4, 4)."""
+    status: list[FrameStatus]
+    """Of each frame."""
 
-    vectors: Sequence[np.ndarray]
-    status: Sequence[str]
-    depth_errors: Sequence[float]
-    motion: np.ndarray
-    first: int = 0
+    def after(self, first: int) -> Trajectory:
+        """The frames from number ``first`` on."""
+        return Trajectory(self.timestamps[first:], self.poses[first:], self.status[first:])
+
+
+@dataclass(frozen=True)
+class Located:
+    """Where the camera of a frame is, and how far that can be believed."""
+
+    T_world_camera: np.ndarray
+    """Pose (4, 4); of a frame that is lost, the best that was found."""
+    why_lost: str = ""
+    """Why the pose can't be trusted; empty if it can."""
+    after_loss: bool = False
+    """Whether the camera was lost before, so that poses before this one say nothing of where it may go."""
+    inliers: float = 1.0
+    """As in `FrameResult`."""
+    depth_error: float = 0.0
+    """As in `FrameResult` [m]."""
+    loss: float | None = None
+    """Mean tracking loss per inlier; None for a pose that was given."""
 
     @property
-    def last(self) -> int | None:
-        """The last frame whose pose is known, if there is one."""
-        return next((n for n in range(len(self.status) - 1, self.first - 1, -1) if self.status[n] == "OK"), None)
+    def status(self) -> FrameStatus:
+        """OK or LOST."""
+        return FrameStatus.LOST if self.why_lost else FrameStatus.OK
+
+
+@dataclass(frozen=True)
+class HistoryState:
+    """A `FrameHistory` as plain arrays, for N frames."""
+
+    timestamps: np.ndarray
+    """[s], float64 (N,)."""
+    poses: np.ndarray
+    """float64 (N, 4, 4)."""
+    status: np.ndarray
+    """Positions in `FrameStatus`, uint8 (N,)."""
+    depth_errors: np.ndarray
+    """[m], float64 (N,)."""
+    motion: np.ndarray
+    """float64 (4, 4)."""
+    first: int
+    """Frame from which the camera has moved without a break."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All but ``first``, by name."""
+        return {name: value for name, value in vars(self).items() if name != "first"}
+
+    @classmethod
+    def read(cls, fields: StateFields) -> HistoryState:
+        """From a saved state whose arrays are `arrays`, and whose header has ``first``.
+
+        Raises:
+            CheckpointError: A field is missing or damaged.
+        """
+        poses = fields.array("poses", np.float64, (None, 4, 4))
+        count = len(poses)
+        status = fields.array("status", np.uint8, (count,))
+        if (status >= len(FrameStatus)).any():
+            raise fields.damaged("status", f"codes beyond {len(FrameStatus) - 1}")
+        return cls(
+            timestamps=fields.array("timestamps", np.float64, (count,)),
+            poses=poses,
+            status=status,
+            depth_errors=fields.array("depth_errors", np.float64, (count,)),
+            motion=fields.array("motion", np.float64, (4, 4)),
+            first=fields.integer("first"),
+        )
+
+
+class FrameHistory:
+    """Time, pose, status and depth error of every frame, and the motion of the camera.
+
+    A frame that is not OK has the pose of the frame before it.
+    """
+
+    def __init__(self) -> None:
+        self._timestamps: list[float] = []
+        self._poses: list[np.ndarray] = []
+        self._status: list[FrameStatus] = []
+        self._depth_errors: list[float] = []
+        # Of the last frame against the one before, as it was tracked. The poses may say something else since: bundle
+        # adjustment has moved one of them, and that is no motion of the camera.
+        self._motion = np.eye(4)
+        # From here on the camera has moved without a break; poses before say nothing of where it is.
+        self._first = 0
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    # -- told ----------------------------------------------------------------------------------------------------
+
+    def add(self, timestamp: float, located: Located) -> None:
+        """The next frame, whose camera was looked for."""
+        if located.after_loss:
+            self._first = len(self)
+        if located.status is not FrameStatus.OK:
+            self._append(timestamp, self.last_pose, FrameStatus.LOST)
+            return
+        if self._poses:
+            self._motion = np.linalg.inv(self.last_pose) @ located.T_world_camera
+        self._append(timestamp, located.T_world_camera, FrameStatus.OK, located.depth_error)
+
+    def skip(self, timestamp: float) -> None:
+        """The next frame, in which there is nothing usable."""
+        self._append(timestamp, self.last_pose, FrameStatus.SKIPPED)
+
+    def correct(self, index: int, T_world_camera: np.ndarray) -> None:
+        """Bundle adjustment found a better pose of a frame."""
+        self._poses[index] = T_world_camera.copy()
+
+    def break_off(self) -> None:
+        """The camera may be anywhere when the next frame comes."""
+        self._first = len(self)
+
+    def _append(self, timestamp: float, pose: np.ndarray, status: FrameStatus, depth_error: float = 0.0) -> None:
+        self._timestamps.append(timestamp)
+        self._poses.append(pose.copy())
+        self._status.append(status)
+        self._depth_errors.append(depth_error)
+
+    # -- asked ---------------------------------------------------------------------------------------------------
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """All frames so far."""
+        poses = np.array(self._poses, np.float64).reshape(-1, 4, 4)
+        return Trajectory(np.array(self._timestamps), poses, list(self._status))
+
+    def pose(self, index: int) -> np.ndarray:
+        """Pose of a frame (4, 4)."""
+        return self._poses[index].copy()
+
+    def status(self, index: int) -> FrameStatus:
+        """Status of a frame."""
+        return self._status[index]
+
+    def timestamp(self, index: int) -> float:
+        """Time of a frame [s]."""
+        return self._timestamps[index]
+
+    @property
+    def last_pose(self) -> np.ndarray:
+        """Pose of the last frame (4, 4), the identity before there is one."""
+        return self._poses[-1] if self._poses else np.eye(4)
+
+    @property
+    def last_timestamp(self) -> float:
+        """Time of the last frame [s], 0 before there is one."""
+        return self._timestamps[-1] if self._timestamps else 0.0
+
+    @property
+    def last_known(self) -> int | None:
+        """The last frame whose pose is known and says something of where the camera is now, if there is one."""
+        return next(self._known(), None)
+
+    @property
+    def was_known(self) -> bool:
+        """Whether the pose of the very last frame is known."""
+        return self.last_known is not None and self.last_known == len(self) - 1
 
     def starts(self, constant_speed: bool) -> list[np.ndarray]:
         """Where the camera may be now, most likely first: constant speed (if on and known), and the last known pose."""
-        last = self.last
+        last = self.last_known
         if last is None:
             return []
-        T = pose_from_vector(self.vectors[last])
-        if constant_speed and last > self.first and last == len(self.status) - 1 and self.status[last - 1] == "OK":
-            return [T @ self.motion, T]
+        T = self._poses[last]
+        if constant_speed and last == len(self) - 1 and self._follows(last):
+            return [T @ self._motion, T]
         return [T]
 
     def is_jump(self, T_world_camera: np.ndarray, max_step: float, max_turn: float) -> bool:
         """Whether the camera can't well have come to a pose: a step beyond ``max_step`` [m] or ``max_turn`` [degrees] a
         frame, and far beyond the recent ones.
         """
-        last = self.last
+        last = self.last_known
         if last is None:
             return False
-        recent = [self._step(n - 1, n) for n in self._recent() if n > self.first and self.status[n - 1] == "OK"]
+        recent = [motion_between(self._poses[n - 1], self._poses[n]) for n in self._recent() if self._follows(n)]
         # Before any step is known the camera may be a fast one.
         usual = np.median(recent, axis=0) if recent else np.array([max_step, max_turn])
-        elapsed = len(self.status) - last
-        step = motion_between(pose_from_vector(self.vectors[last]), T_world_camera)
+        elapsed = len(self) - last
+        step = motion_between(self._poses[last], T_world_camera)
         return bool((np.array(step) > elapsed * np.maximum(STEP_FACTOR * usual, [max_step, max_turn])).any())
 
     def depth_error(self) -> float:
         """Median depth error of the recent frames [m], 0 if there are none."""
-        errors = [self.depth_errors[n] for n in self._recent() if self.depth_errors[n] > 0]
+        errors = [self._depth_errors[n] for n in self._recent() if self._depth_errors[n] > 0]
         return float(np.median(errors)) if errors else 0.0
 
-    def _recent(self) -> list[int]:
-        known = (n for n in range(len(self.status) - 1, self.first - 1, -1) if self.status[n] == "OK")
-        return list(islice(known, RECENT_FRAMES))
+    def _known(self) -> Iterator[int]:
+        return (n for n in range(len(self) - 1, self._first - 1, -1) if self._status[n] is FrameStatus.OK)
 
-    def _step(self, a: int, b: int) -> tuple[float, float]:
-        return motion_between(pose_from_vector(self.vectors[a]), pose_from_vector(self.vectors[b]))
+    def _recent(self) -> list[int]:
+        return list(islice(self._known(), RECENT_FRAMES))
+
+    def _follows(self, index: int) -> bool:
+        """Whether the frame before one is known, too, without a break between."""
+        return index > self._first and self._status[index - 1] is FrameStatus.OK
+
+    # -- saved ---------------------------------------------------------------------------------------------------
+
+    def state(self) -> HistoryState:
+        """All of it as arrays."""
+        order = list(FrameStatus)
+        return HistoryState(
+            timestamps=np.array(self._timestamps, np.float64),
+            poses=np.array(self._poses, np.float64).reshape(-1, 4, 4),
+            status=np.array([order.index(status) for status in self._status], np.uint8),
+            depth_errors=np.array(self._depth_errors, np.float64),
+            motion=self._motion,
+            first=self._first,
+        )
+
+    @classmethod
+    def restored(cls, state: HistoryState) -> FrameHistory:
+        """What `state` was taken from."""
+        order, history = list(FrameStatus), cls()
+        history._timestamps = state.timestamps.tolist()
+        history._poses = list(state.poses.copy())
+        history._status = [order[code] for code in state.status]
+        history._depth_errors = state.depth_errors.tolist()
+        history._motion, history._first = state.motion.copy(), state.first
+        return history

@@ -10,9 +10,9 @@ from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.errors import CheckpointError, ConfigError
 from warpslam.frames import FrameResult
-from warpslam.poses import vector_from_pose
 from warpslam.slam_state import saved_config
 from warpslam.storage.state_file import StateFormat, read_state, write_state
+from warpslam.trajectory import Located
 
 CAMERA = Intrinsics(20, 20, 15.5, 11.5, 32, 24)
 
@@ -27,10 +27,10 @@ class Counter(Baseline):
         super().__init__(intrinsics, config, device, seed)
         self.sum = np.zeros(1)
 
-    def _step(self, index, timestamp, rgb, depth, given):
-        self.sum += depth.sum()
-        self._append(vector_from_pose(given), timestamp, "OK")
-        return FrameResult(index, timestamp, given)
+    def _step(self, frame):
+        self.sum += frame.depth.sum()
+        self.history.add(frame.timestamp, Located(frame.given_pose))
+        return FrameResult(frame.index, frame.timestamp, frame.given_pose)
 
     def _state(self):
         return {}, {"sum": self.sum}
@@ -67,8 +67,9 @@ def test_a_saved_map_goes_on_where_it_was(counter, tmp_path):
     ("name", "value"),
     [
         ("seed", -1), ("config", {"grid": {"margin": -1}}), ("config", None), ("intrinsics", {"fx": 1}),
-        ("intrinsics", []), ("status", ["OK"]), ("status", ["OK", "OK", "WELL"]), ("status", "OK"),
-        ("vectors", np.zeros((3, 6))), ("timestamps", np.zeros(2)), ("sum", np.zeros(2)), ("sum", np.full(1, np.nan)),
+        ("intrinsics", []), ("status", np.zeros(2, np.uint8)), ("status", np.array([0, 0, 9], np.uint8)),
+        ("status", np.zeros(3)), ("poses", np.zeros((3, 6))), ("first", -1), ("motion", np.full((4, 4), np.nan)),
+        ("timestamps", np.zeros(2)), ("sum", np.zeros(2)), ("sum", np.full(1, np.nan)),
     ],
 )  # fmt: skip
 def test_every_field_is_checked(counter, tmp_path, name, value):

@@ -16,6 +16,7 @@ from warpslam.pipeline.setup import load_slam
 from warpslam.runs.folder import RunFolder
 from warpslam.slam_state import saved_config
 from warpslam.storage.state_file import read_state, write_state
+from warpslam.trajectory import FrameHistory, Located
 
 CAMERA = Intrinsics(40.0, 40.0, 31.5, 23.5, 64, 48)
 SMALL = [
@@ -81,14 +82,17 @@ def test_tracking_follows_a_moved_camera(trained):
     before = trained.network.weights.numpy().copy()
     start = trained._scaled(np.array([1.0, 0, 0, 0, 0.0, 0.0, 0.08]))
     trained._images.set(0, rgb, depth * np.float32(trained._settings.scale))
-    _, loss_before, error_before, _ = trained._judge(1, start)
-    trained._vectors.append(np.array([1.0, 0, 0, 0, 0.0, 0.0, 0.08]))
+    before_it, loss_before = trained._judge(1, start)
+    history, trained.history = trained.history, FrameHistory()
+    aside = np.eye(4)
+    aside[2, 3] = 0.08
+    trained.history.add(0.0, Located(aside))
     try:
-        vector, loss, error, kept = trained._track(1)
+        located, loss = trained._track(1)
     finally:
-        trained._vectors.pop()
-    assert loss < loss_before and error < error_before and kept > 0.9
-    assert abs(vector[6]) < 0.078
+        trained.history = history
+    assert loss < loss_before and located.depth_error < before_it.depth_error and located.inliers > 0.9
+    assert abs(located.T_world_camera[2, 3]) < 0.078
     np.testing.assert_array_equal(trained.network.weights.numpy(), before)
 
 

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
+
 import numpy as np
 import pytest
+from trimesh.proximity import closest_point_naive
 
 from tests.fakes import FakeSequence, FakeSlam, Terminal, wall
-from warpslam import cli
+from warpslam import __version__, cli
 from warpslam.cli.common import parse_frames
+from warpslam.errors import DatasetError
+from warpslam.field.decoders import random_decoders
 from warpslam.pipeline import finished as revisit
 from warpslam.pipeline import run as pipeline
 from warpslam.storage.json_files import read_json
@@ -123,6 +130,7 @@ def test_interrupted_run_exits_130_with_partial_results(faked, tmp_path, monkeyp
         (["demo", "--device", "cuda:77"], "cuda:77"),
         (["profile", "demo", "--frames", "0:2", "--device", "cuda:77"], "cuda:77"),
         (["profile", "demo", "--json", "/no/such/folder/p.json"], "/no/such/folder"),
+        (["render-room", "sheet", "--seeds", "0", "-o", "/no/such/folder/p.png"], "/no/such/folder/p.png"),
     ],
 )
 def test_errors_are_one_line_and_exit_2(arguments, message, tmp_path, capsys):
@@ -136,8 +144,6 @@ def test_errors_are_one_line_and_exit_2(arguments, message, tmp_path, capsys):
 
 def test_debug_shows_the_traceback():
     """With --debug the exception comes through."""
-    from warpslam.errors import DatasetError
-
     with pytest.raises(DatasetError):
         cli.main(["eval", "/no/such/run", "--debug"])
 
@@ -164,8 +170,6 @@ def test_frames_are_a_python_slice(text, expected):
 
 def test_eval_prints_figures(faked, tmp_path, capsys):
     """RMSE aligned and unaligned in cm, RPE, and how many frames were compared; --json gives the same as JSON."""
-    import json
-
     run = str(tmp_path / "run")
     cli.main(["run", "seq", "-o", run])
     capsys.readouterr()
@@ -232,15 +236,11 @@ def test_demo_sequence_is_small_and_exact():
     z, k = frame.depth[v, u][keep].astype(float), sequence.intrinsics
     points = np.stack([(u[keep] - k.cx) / k.fx * z, (v[keep] - k.cy) / k.fy * z, z, np.ones_like(z)])
     world = (frame.T_world_camera @ points)[:3].T
-    from trimesh.proximity import closest_point_naive
-
     assert closest_point_naive(sequence.mesh, world)[1].max() < 0.01
 
 
 def test_info_names_versions_devices_and_decoders(capsys, tmp_path):
     """One screen that a bug report needs, with the decoder file that is asked about."""
-    from warpslam.field.decoders import random_decoders
-
     random_decoders().save(tmp_path / "d.pth")
     assert cli.main(["info", "--decoders", str(tmp_path / "d.pth")]) == 0
     out = capsys.readouterr().out
@@ -250,23 +250,64 @@ def test_info_names_versions_devices_and_decoders(capsys, tmp_path):
         assert word in out, word
 
 
-@pytest.mark.parametrize("command", [module.__name__.rpartition(".")[2] for module in cli.COMMANDS])
+@pytest.mark.parametrize("command", cli.COMMANDS)
 def test_each_command_explains_itself(command, capsys):
-    """``--help`` of every command can be formatted, and names its options."""
+    """``--help`` of a command says what ``warpslam --help`` says of it, and names its options."""
     with pytest.raises(SystemExit) as exit_:
-        cli.main([{"evaluate": "eval"}.get(command, command), "--help"])
+        cli.main([command, "--help"])
     assert exit_.value.code == 0
-    assert "--debug" in capsys.readouterr().out
+    out = " ".join(capsys.readouterr().out.split())
+    text = cli.COMMANDS[command][1]
+    assert text[0].upper() + text[1:] + "." in out and "options: -h, --help" in out
+    with pytest.raises(SystemExit):
+        cli.main(["--help"])
+    assert f"{command} {text}" in " ".join(capsys.readouterr().out.split())
+
+
+def test_only_the_command_asked_for_is_imported():
+    """``--help`` and ``--version`` load no command and no NumPy; ``check`` loads itself, and neither torch nor Warp."""
+    code = (
+        "import sys, contextlib\n"
+        "from warpslam import cli\n"
+        "with contextlib.suppress(SystemExit): cli.main(sys.argv[1:])\n"
+        "print(*sys.modules, file=sys.stderr)"
+    )
+
+    def loaded(*arguments: str) -> set[str]:
+        done = subprocess.run([sys.executable, "-c", code, *arguments], check=True, capture_output=True, text=True)
+        return set(done.stderr.split())
+
+    for arguments in (["--help"], ["--version"]):
+        modules = loaded(*arguments)
+        assert not {f"warpslam.cli.{module}" for module, _ in cli.COMMANDS.values()} & modules
+        assert "warpslam.cli" in modules and not {"numpy", "torch", "warp"} & modules
+    modules = loaded("check", "--help")
+    assert "warpslam.cli.check" in modules and not {"warpslam.cli.run", "torch", "warp"} & modules
+
+
+@pytest.mark.parametrize("command", [*cli.COMMANDS, "render-room sequence", "render-room sheet"])
+def test_shared_options_read_alike(command, capsys):
+    """What several commands take has one wording, and every command can show the traceback of an error."""
+    with pytest.raises(SystemExit):
+        cli.main([*command.split(), "--help"])
+    out = " ".join(capsys.readouterr().out.split())
+    assert "--debug" in out or command == "render-room"
+    wording = {
+        "--device DEVICE": "cpu, cuda:0, ... (default: a GPU if there is one)",
+        "--dataset DATASET": "format of the folder (default: told from its file names)",
+        "--camera FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE": "camera, not the dataset's",
+    }
+    for option, text in wording.items():
+        if option in out and command != "warmup":  # which takes architectures, too
+            assert f"{option} {text}" in out
 
 
 def test_version(capsys):
     """The version is that of the package."""
-    import warpslam
-
     with pytest.raises(SystemExit) as exit_:
         cli.main(["--version"])
     assert exit_.value.code == 0
-    assert capsys.readouterr().out.strip() == f"warpslam {warpslam.__version__}"
+    assert capsys.readouterr().out.strip() == f"warpslam {__version__}"
 
 
 def test_progress_bar_on_a_terminal(monkeypatch, faked, tmp_path):

@@ -49,7 +49,7 @@ def test_no_iteration_is_spent_on_a_frozen_middle_level():
     """The middle stage has nothing to optimise then, and becomes part of the fine one."""
 
     def stages(*overrides: str) -> list[str]:
-        return Slam(CAMERA, Config.from_preset("default", overrides), "cpu")._mapper._schedule(10, refinement=False)
+        return Slam(CAMERA, Config.from_preset("default", overrides), "cpu").mapper._schedule(10, refinement=False)
 
     assert stages() == ["middle"] * 5 + ["fine"] * 2 + ["color"] * 3
     assert stages("mapping.optimize_middle=false") == ["fine"] * 7 + ["color"] * 3

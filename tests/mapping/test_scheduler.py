@@ -51,18 +51,18 @@ class Gate:
     def __init__(self, slam: Slam, monkeypatch) -> None:
         self.open, self.reached, self.frames = threading.Event(), threading.Event(), []
         self.error: Exception | None = None
-        original = slam._mapper.start_frame
+        original = slam.mapper.start_frame
 
         def start_frame(images, frame, vector, keyframes):
             self.frames.append(frame)
             self.reached.set()
             assert self.open.wait(WAIT)
             if self.error is not None:
-                slam._mapper.scene.grids["middle"].features.fill_(np.nan)
+                slam.mapper.scene.grids["middle"].features.fill_(np.nan)
                 raise self.error
             return original(images, frame, vector, keyframes)
 
-        monkeypatch.setattr(slam._mapper, "start_frame", start_frame)
+        monkeypatch.setattr(slam.mapper, "start_frame", start_frame)
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def gated(frames, monkeypatch):
 def test_waiting_after_every_frame_equals_strict(frames):
     """If each task is taken over before the next frame, nothing may differ from strict: poses, features, decoder."""
     strict, overlapped = new_slam(schedule="schedule=strict"), new_slam()
-    assert isinstance(strict._scheduler, Strict) and isinstance(overlapped._scheduler, Overlapped)
+    assert isinstance(strict.scheduler, Strict) and isinstance(overlapped.scheduler, Overlapped)
     for frame in frames:
         for slam in (strict, overlapped):
             step(slam, frame)
@@ -101,14 +101,14 @@ def test_tracking_goes_on_while_the_mapper_works(frames, gated):
     step(slam, frames[1])
     step(slam, frames[2])
     assert gate.reached.wait(WAIT)
-    before, version = features(slam), slam._scheduler.version
+    before, version = features(slam), slam.scheduler.version
     assert step(slam, frames[3]).status == "OK"
-    assert slam._scheduler.version == version == 1
+    assert slam.scheduler.version == version == 1
     for level, values in before.items():
         np.testing.assert_array_equal(slam.scene.grids[level].features.numpy(), values)
     gate.open.set()
     slam.wait()
-    assert slam._scheduler.version == 2
+    assert slam.scheduler.version == 2
     waited = new_slam()
     for frame in frames[:3]:
         step(waited, frame)
@@ -125,9 +125,9 @@ def test_mapper_and_tracker_leave_each_other_alone(frames, monkeypatch, optimize
     settings = [f"tracking.optimizer={optimizer}", "mapping.bundle_adjustment_keyframes=2", "mapping.iterations=20"]
 
     def track(slam: Slam) -> np.ndarray:
-        slam._tracker._launcher.forget()
+        slam.tracker._launcher.forget()
         start = frames[4].T_world_camera
-        return slam._tracker.track(slam.scene.arrays(), slam._images, 4, start).T_world_camera
+        return slam.tracker.track(slam.scene.arrays(), slam.images, 4, start).T_world_camera
 
     alone, together = new_slam(*settings), new_slam(*settings)
     for slam in (alone, together):
@@ -141,7 +141,7 @@ def test_mapper_and_tracker_leave_each_other_alone(frames, monkeypatch, optimize
     alone.wait()
     step(together, frames[4])
     poses = []
-    while not together._scheduler.has_finished:
+    while not together.scheduler.has_finished:
         poses.append(track(together))
     together.wait()
     assert len(poses) > 1
@@ -160,13 +160,13 @@ def test_map_is_at_most_one_task_behind(frames, gated):
     waiting = threading.Thread(target=step, args=(slam, frames[4]))
     waiting.start()
     waiting.join(0.5)
-    assert waiting.is_alive() and gate.frames == [2] and slam._scheduler.version == 1
+    assert waiting.is_alive() and gate.frames == [2] and slam.scheduler.version == 1
     assert len(slam.trajectory.poses) == 4
     gate.open.set()
     waiting.join(WAIT)
-    assert not waiting.is_alive() and slam._scheduler.version == 2
+    assert not waiting.is_alive() and slam.scheduler.version == 2
     slam.wait()
-    assert gate.frames == [2, 4] and slam._scheduler.version == 3
+    assert gate.frames == [2, 4] and slam.scheduler.version == 3
 
 
 def test_refined_poses_reach_keyframes_and_trajectory(frames, monkeypatch):
@@ -184,7 +184,7 @@ def test_refined_poses_reach_keyframes_and_trajectory(frames, monkeypatch):
     slam.wait()
     assert not np.array_equal(slam.keyframes[-1].pose, tracked)
     for keyframe in slam.keyframes:
-        np.testing.assert_array_equal(slam._vectors[keyframe.index], keyframe.pose)
+        np.testing.assert_array_equal(slam.history.pose(keyframe.index), keyframe.pose)
 
 
 def test_losses_come_with_the_frame_that_takes_them_over(frames, gated):
@@ -193,7 +193,7 @@ def test_losses_come_with_the_frame_that_takes_them_over(frames, gated):
     step(slam, frames[1])
     assert set(step(slam, frames[2]).losses) == {"tracking"}
     gate.open.set()
-    while not slam._scheduler.has_finished:
+    while not slam.scheduler.has_finished:
         time.sleep(0.01)
     assert {"tracking", "middle", "color"} <= set(step(slam, frames[3]).losses)
 
@@ -211,7 +211,7 @@ def test_map_grows_beside_tracking(frames, monkeypatch):
     gate.open.set()
     slam.wait()
     assert slam.scene.grids["middle"].row_count > rows and (slam.scene.bounds[1] >= high + 2.0).all()
-    for level, grid in slam._mapper.scene.grids.items():
+    for level, grid in slam.mapper.scene.grids.items():
         np.testing.assert_array_equal(slam.scene.grids[level].features.numpy(), grid.features.numpy())
         assert slam.scene.grids[level].features.ptr != grid.features.ptr
     assert step(slam, frames[2]).status == "OK"
@@ -226,7 +226,7 @@ def test_failure_of_the_mapper_surfaces_once(frames, gated, tmp_path, call):
     step(slam, frames[1])
     step(slam, frames[2])
     gate.open.set()
-    while not slam._scheduler.has_finished:
+    while not slam.scheduler.has_finished:
         time.sleep(0.01)
     calls = {
         "step": lambda: step(slam, frames[3]),
@@ -251,15 +251,15 @@ def test_interrupt_while_waiting_loses_nothing(frames, gated, monkeypatch):
     slam, gate = gated
     for frame in frames[1:4]:
         step(slam, frame)
-    future = slam._scheduler._beside._future
+    future = slam.scheduler._beside._future
     with monkeypatch.context() as patch:
         patch.setattr(future, "result", lambda: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             step(slam, frames[4])
-    assert slam._scheduler.version == 1
+    assert slam.scheduler.version == 1
     gate.open.set()
     slam.finish()
-    assert slam._scheduler.version > 2 and not mapping_threads()
+    assert slam.scheduler.version > 2 and not mapping_threads()
 
 
 def test_finish_leaves_no_thread_and_maps_the_last_frame(frames):
@@ -270,7 +270,7 @@ def test_finish_leaves_no_thread_and_maps_the_last_frame(frames):
     timings = slam.finish()
     assert not mapping_threads() and {"mapping", "refinement"} <= set(timings)
     assert slam._mapped == 7
-    for level, grid in slam._mapper.scene.grids.items():
+    for level, grid in slam.mapper.scene.grids.items():
         np.testing.assert_array_equal(slam.scene.grids[level].features.numpy(), grid.features.numpy())
 
 
@@ -281,9 +281,9 @@ def test_saving_waits_and_a_loaded_map_goes_on(frames, gated, tmp_path):
         step(slam, frame)
     threading.Timer(0.3, gate.open.set).start()
     slam.save(tmp_path / "map")
-    assert slam._scheduler.version == 2
+    assert slam.scheduler.version == 2
     loaded = Slam.load(tmp_path / "map", "cpu")
-    assert isinstance(loaded._scheduler, Overlapped)
+    assert isinstance(loaded.scheduler, Overlapped)
     for level, values in features(slam).items():
         np.testing.assert_array_equal(loaded.scene.grids[level].features.numpy(), values)
     for other in (slam, loaded):
@@ -298,7 +298,7 @@ def test_memory_limit_counts_both_maps(frames):
     slam = new_slam()
     step(slam, frames[0])
     low, high = slam.scene.bounds
-    alone, beside = slam.scene.gigabytes(low, high), slam._mapper.scene.gigabytes(low, high)
+    alone, beside = slam.scene.gigabytes(low, high), slam.mapper.scene.gigabytes(low, high)
     rows = sum(float(np.prod((high - low) / grid.spacing + 2)) for grid in slam.scene.grids.values())
     assert beside - alone == pytest.approx(rows * 32 * 4 / 1e9)
 

@@ -15,9 +15,10 @@ from tests.test_slam import CAMERA, new_slam
 from warpslam import cli
 from warpslam.camera import Intrinsics
 from warpslam.errors import WarpSlamError
-from warpslam.field.arrays import Thresholds
+from warpslam.field.arrays import Gradients, Thresholds
+from warpslam.kernels.decoder import decoders_for
 from warpslam.profiling import costs, recorder
-from warpslam.runtime import launching, phases
+from warpslam.runtime import launching, phases, program
 from warpslam.runtime.phases import phase
 from warpslam.synthetic import SyntheticSequence, demo
 
@@ -35,8 +36,8 @@ KERNELS = {
     "_facing_kernel",
 }  # fmt: skip
 HOOKED = (
-    (warp_context, "invoke"), (wp, "launch"), (wp.Launch, "launch"), (wp.Module, "load"), (launching, "_pool"),
-    (launching.Launcher, "iterate"), (launching.Program, "run"),
+    (warp_context, "invoke"), (wp, "launch"), (wp.Launch, "launch"), (wp.Module, "load"), (program, "_pool"),
+    (launching.Launcher, "iterate"), (program.Program, "run"),
 )  # fmt: skip
 
 
@@ -213,7 +214,7 @@ def test_phases_nest_and_follow_the_thread():
 
     with warpslam.profile() as profile, phase("outer"):
         assert inner(1) == "outer / inner / inner"
-        assert launching._pool().submit(lambda: phases.current().path).result() == "outer"
+        assert program._pool().submit(lambda: phases.current().path).result() == "outer"
     rows = {row.phase: row for row in profile.report.phases}
     assert rows["outer / inner"].calls == rows["outer / inner / inner"].calls == 1
     assert rows["outer"].wait > 0
@@ -224,7 +225,7 @@ def test_counted_points_are_those_computed(frames, min_transmittance, monkeypatc
     """The points counted beforehand are the ones whose outputs a kernel then writes."""
     slam = new_slam("mapping.first_iterations=60", "mapping.coarse=false")
     steps(slam, frames[:1])
-    batch, arrays = slam._mapper._batch, slam.scene.arrays()
+    batch, arrays = slam.mapper._batch, slam.scene.arrays()
     thresholds = Thresholds(min_weight=0.02, min_transmittance=min_transmittance)
     for bits in {id(array): array for array in batch.bits.values()}.values():
         bits.fill_(0xFFFFFFFF)
@@ -246,8 +247,6 @@ def test_counted_points_are_those_computed(frames, min_transmittance, monkeypatc
     gradient[:total:3] = np.linspace(-1, 1, len(gradient[:total:3]))
     batch.logit_grad.assign(gradient)
     batch.point_grad.zero_()
-    from warpslam.field.arrays import Gradients
-
     batch.steep_count.zero_()
     batch.launcher.launch(*batch._steep(0, batch.count, 0, 0.25))
     step = batch._geometry_adjoint(arrays, "middle", Gradients(points=True), 0, batch.count, 0, batch.point_grad)
@@ -273,9 +272,9 @@ def test_operations_of_the_adjoints():
 def test_what_cannot_be_counted_is_a_bound(frames):
     """Arrays that lie on another device leave the number of points of the launch, and say so."""
     slam = new_slam()
-    names = [argument.label for argument in launching.decoders_for(slam.device).middle_forward.adj.args]
+    names = [argument.label for argument in decoders_for(slam.device).middle_forward.adj.args]
     values = [dict(point_count=800, width=8, first_ray=0).get(name) for name in names]
-    kernel = launching.decoders_for(slam.device).middle_forward
+    kernel = decoders_for(slam.device).middle_forward
     work = costs.work_of(kernel, False, 200, costs.Arguments(kernel, values, readable=False))
     assert (work.points, work.counted) == (800, False)
 
@@ -283,15 +282,15 @@ def test_what_cannot_be_counted_is_a_bound(frames):
 def test_device_times_go_to_the_phase_they_belong_to(monkeypatch):
     """On CUDA the driver's times are read when the phase changes and matched with the launches noted since."""
     Timing = namedtuple("Timing", "name elapsed")
-    kernel = launching.decoders_for(wp.get_device("cpu")).transpose_color_weights
+    kernel = decoders_for(wp.get_device("cpu")).transpose_color_weights
     pending: list[Timing] = []
     monkeypatch.setattr(wp, "is_cuda_available", lambda: True)
     monkeypatch.setattr(wp, "timing_begin", lambda cuda_filter: pending.clear())
     monkeypatch.setattr(wp, "timing_end", lambda: list(pending))
     with warpslam.profile() as profile:
         with phase("mapping"):
-            profile._cuda.launched(kernel, False, 480, [])
-            profile._cuda.launched(kernel, True, 480, [])
+            profile._recorder._cuda.launched(kernel, False, 480, [])
+            profile._recorder._cuda.launched(kernel, True, 480, [])
             pending.append(Timing(f"backward kernel {kernel.key}_0123abcd", 4.0))
             pending.append(Timing(f"forward kernel {kernel.key}_0123abcd", 2.0))
             with phase("color"):

@@ -1,4 +1,4 @@
-"""``python -m warpslam.synthetic`` and the folders it writes."""
+"""``warpslam render-room`` and the folders it writes."""
 
 from __future__ import annotations
 
@@ -7,16 +7,15 @@ import pytest
 import trimesh
 from PIL import Image
 
-from warpslam import open_sequence
+from warpslam import cli, open_sequence
 from warpslam.errors import ConfigError
 from warpslam.synthetic import MovingObjectSequence, make_sequence
-from warpslam.synthetic.__main__ import main
 
 
 def written(tmp_path, *arguments: str):
     """Folder of a sequence written by the command, in small."""
     folder = tmp_path / "out"
-    assert main(["sequence", "--out", str(folder), "--size", "64x48", *arguments]) == 0
+    assert cli.main(["render-room", "sequence", "--out", str(folder), "--size", "64x48", *arguments]) == 0
     return folder
 
 
@@ -54,14 +53,14 @@ def test_room_sequence(tmp_path):
 
 
 def test_sheet(tmp_path):
-    """The contact sheet still has its command."""
-    assert main(["sheet", "--seeds", "0", "--views", "1", "--out", str(tmp_path / "rooms.png")]) == 0
+    """A picture of the rooms that are asked for."""
+    assert cli.main(["render-room", "sheet", "--seeds", "0", "--views", "1", "--out", str(tmp_path / "rooms.png")]) == 0
     assert Image.open(tmp_path / "rooms.png").width > 100
 
 
 def test_errors(tmp_path, capsys):
     """What can be put right is one line and exit code 2; an unknown kind names the known ones."""
-    assert main(["sequence", "--kind", "gap", "--frames", "2", "--out", str(tmp_path / "a")]) == 2
-    assert capsys.readouterr().err.startswith("error: a gap of")
+    assert cli.main(["render-room", "sequence", "--kind", "gap", "--frames", "2", "--out", str(tmp_path / "a")]) == 2
+    assert capsys.readouterr().err.startswith("warpslam: a gap of")
     with pytest.raises(ConfigError, match="room, moving, gap"):
         make_sequence("flying")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from trimesh.proximity import closest_point_naive
 
 from warpslam.camera import Intrinsics
 from warpslam.errors import InputError
@@ -39,8 +40,6 @@ def test_an_object_of_furniture_size_crosses_the_view(sequence):
 
 def test_masked_pixels_lie_on_the_object_and_the_others_on_the_room(sequence):
     """Depth, pose, mask and object pose agree: masked points, moved into the object's frame, lie on its mesh."""
-    from trimesh.proximity import closest_point_naive
-
     index = 20
     points, mask = world_points(sequence, index), sequence.object_mask(index)
     T = np.linalg.inv(sequence.object_poses[index])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 
 from warpslam.errors import InputError
 from warpslam.synthetic import make_room
@@ -148,8 +149,6 @@ def test_vertex_colors_match_sample_colors():
     room = make_room(7)
     points, _, colors = room.sample_surface(500, np.random.default_rng(0))
     mesh = room.mesh(0.04)
-    from scipy.spatial import cKDTree
-
     distance, nearest = cKDTree(mesh.vertices).query(points)
     difference = np.abs(mesh.visual.vertex_colors[nearest][:, :3] / 255 - colors).max(axis=1)
     assert distance.max() < 0.05

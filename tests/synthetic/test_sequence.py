@@ -9,13 +9,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+import yaml
 from PIL import Image
 
 from warpslam.camera import Intrinsics
 from warpslam.errors import DatasetError, InputError
 from warpslam.sequences.base import Frame, RgbdSequence
-from warpslam.synthetic import SyntheticSequence, make_room, orbit, room_trajectory, walk, write_replica
-from warpslam.synthetic import __main__ as contact_sheet
+from warpslam.synthetic import (
+    MeshRenderer,
+    SyntheticSequence,
+    contact_sheet,
+    load_mesh,
+    look_at,
+    make_room,
+    orbit,
+    room_trajectory,
+    walk,
+    write_replica,
+)
 
 CAMERA = Intrinsics(50.0, 50.0, 31.5, 23.5, 64, 48)
 
@@ -111,8 +122,6 @@ def test_write_replica_round_trip(sequence, tmp_path):
     np.testing.assert_allclose(depth / 6553.5, frame.depth, atol=0.51 / 6553.5)
     poses = np.loadtxt(folder / "traj.txt").reshape(-1, 4, 4)
     np.testing.assert_array_equal(poses, sequence.ground_truth())
-    import yaml
-
     camera = yaml.safe_load((folder / "camera.yaml").read_text())
     assert camera == {
         "fx": 50.0, "fy": 50.0, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48, "depth_scale": 6553.5
@@ -193,8 +202,6 @@ def test_mesh_tool(tmp_path):
 
 def test_house_mesh_renders(data_dir):
     """The textured house shows a dining table within 1-4 m, in many colours and without misses."""
-    from warpslam.synthetic import MeshRenderer, load_mesh, look_at
-
     path = data_dir / "house_mesh" / "scene.obj"
     if not path.is_file():
         pytest.skip(f"{path} is not there")

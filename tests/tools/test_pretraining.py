@@ -16,6 +16,7 @@ from tools.decoders.training import Trainer, TrainingConfig
 from warpslam.errors import CheckpointError
 from warpslam.field.decoder_files import load_decoders
 from warpslam.field.decoders import LEVELS, random_decoders
+from warpslam.synthetic import make_room
 
 SIZES = SampleSizes(surface=3000, points=12000, cameras=4, rays=80)
 SMALL = TrainingConfig(
@@ -254,8 +255,6 @@ def test_free_space_feature_is_of_free_space():
 
 def test_packaged_decoders_beat_random_ones():
     """The weights that ship map a held-out room better, as on a first frame, and their residual starts near zero."""
-    from warpslam.synthetic import make_room
-
     room = make_samples(make_room(HELD_OUT_SEED), HELD_OUT_SEED, replace(SIZES, cameras=3, rays=300))
     trained, chance = (fit_room(d, room, 40, 0, rays=60, factor=5.0) for d in (load_decoders(), random_decoders(0)))
     assert trained["depth_l1_cm"] < 0.7 * chance["depth_l1_cm"]

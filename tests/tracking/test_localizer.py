@@ -8,12 +8,12 @@ import pytest
 from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.field.decoder_files import load_decoders
-from warpslam.poses import motion_between, pose_from_vector, vector_from_pose
+from warpslam.poses import motion_between, pose_from_vector
 from warpslam.slam import Slam
 from warpslam.synthetic import SyntheticSequence
 from warpslam.tracking.localizer import Localizer
 from warpslam.tracking.thumbnail import Thumbnail
-from warpslam.trajectory import Track
+from warpslam.trajectory import FrameHistory, Located
 
 CAMERA = Intrinsics(62.5, 62.5, 39.5, 29.5, 80, 60)
 SETTINGS = [
@@ -122,12 +122,20 @@ def test_localize_only_takes_a_given_first_pose(sequence, saved, monkeypatch):
         assert result.status == "OK" and error(result, frame) < 0.03
 
 
-def track(steps: list[float], status: str = "", first: int = 0) -> Track:
+def track(steps: list[float], status: str = "", first: int = 0) -> FrameHistory:
     """A camera that moved along x by ``steps`` [m]; ``status`` has a letter a frame."""
-    vectors = [vector_from_pose(np.eye(4)) + [0, 0, 0, 0, x, 0, 0] for x in np.cumsum([0.0, *steps])]
-    names = {"O": "OK", "L": "LOST", "S": "SKIPPED"}
-    words = [names[letter] for letter in status or "O" * len(vectors)]
-    return Track(vectors, words, [0.02] * len(vectors), at(steps[-1] if steps else 0.0), first)
+    history = FrameHistory()
+    for n, x in enumerate(np.cumsum([0.0, *steps])):
+        letter = status[n] if status else "O"
+        if n == first:
+            history.break_off()
+        if letter == "S":
+            history.skip(float(n))
+        else:
+            history.add(float(n), Located(at(x), "nowhere" if letter == "L" else "", depth_error=0.02))
+    if first > len(steps):
+        history.break_off()
+    return history
 
 
 def at(x: float) -> np.ndarray:

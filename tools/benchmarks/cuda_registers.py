@@ -16,6 +16,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import warp as wp
+
+from warpslam.cli.common import quiet_warp
+from warpslam.runtime.compilation import find_module, module_names
+
 _SECTION = struct.Struct("<IIQQQQIIQQ")
 _SYMBOL = struct.Struct("<IBBHQQ")
 _INSTRUCTION_BYTES = 16
@@ -29,21 +34,20 @@ REGISTER_LIMIT = 255
 
 @dataclass(frozen=True)
 class KernelResources:
-    """What a thread of a kernel takes.
-
-    name: Entry point in the cubin.
-    registers: 32-bit registers, at most 255.
-    frame: Local memory [bytes]: arrays that are indexed at run time, and spilled registers.
-    spill_stores, spill_loads: Bytes of the instructions that spill and refill registers, each counted once.
-    code: Size of the machine code [bytes].
-    """
+    """What a thread of a kernel takes."""
 
     name: str
+    """Entry point in the cubin."""
     registers: int
+    """32-bit registers, at most 255."""
     frame: int
+    """Local memory [bytes]: arrays that are indexed at run time, and spilled registers."""
     spill_stores: int
+    """Bytes of the instructions that spill registers, each counted once."""
     spill_loads: int
+    """Bytes of those that refill them."""
     code: int
+    """Size of the machine code [bytes]."""
 
     @property
     def spills(self) -> bool:
@@ -136,10 +140,6 @@ def _spills(code: bytes, info: bytes) -> tuple[int, int]:
 
 def compiled_cubin(name: str, architecture: int) -> Path:
     """Cubin of a Warp module, from the kernel cache if the same source was compiled before."""
-    import warp as wp
-
-    from warpslam.runtime.compilation import find_module
-
     (path,) = wp.compile_aot_module(find_module(name), arch=[architecture], use_ptx=False)
     return path
 
@@ -161,9 +161,6 @@ def markdown_table(kernels: dict[int, dict[str, list[KernelResources]]]) -> str:
 
 
 def main() -> None:
-    from warpslam.cli.common import quiet_warp
-    from warpslam.runtime.compilation import module_names
-
     quiet_warp()
     parser = argparse.ArgumentParser(description="Registers and spills of every CUDA kernel, as a Markdown table.")
     parser.add_argument("--arch", type=int, nargs="+", default=[80, 90], help="compute capabilities (80 90)")

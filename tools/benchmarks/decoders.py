@@ -24,6 +24,7 @@ from tools.benchmarks.iterations import CAMERA, SPACING, Ours
 from warpslam.field.arrays import Gradients, GridGradient, gradient_buffers
 from warpslam.field.ray_batch import RayBatch
 from warpslam.kernels.decoder import COLOR_WEIGHT_ROWS
+from warpslam.poses import vector_from_pose
 from warpslam.runtime.launching import Launcher
 from warpslam.synthetic import SyntheticSequence
 
@@ -77,11 +78,11 @@ def iterate(ours: Ours, gradients: Gradients, count: int) -> None:
     batch = RayBatch(pixels, sampling.stratified + sampling.surface, slam.device, launcher)
     batch.set_seeds([0])
     window = wp.zeros(1, dtype=int, device=slam.device)
-    poses = wp.array(ours.vector[None], dtype=float, device=slam.device, requires_grad=True)
+    poses = wp.array(vector_from_pose(ours.poses[5])[None], dtype=float, device=slam.device, requires_grad=True)
     arrays = slam.scene.arrays()
     for _ in range(count):
         with launcher.tape() as tape:
-            batch.draw(slam._images.arrays, window, pixels, CAMERA)
+            batch.draw(slam.images.arrays, window, pixels, CAMERA)
             batch.cast(poses, differentiate=gradients.points)
             batch.bound(arrays)
             batch.place_samples(sampling.stratified, sampling.surface, jitter=True)

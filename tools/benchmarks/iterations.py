@@ -17,7 +17,11 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any, Literal
+from unittest import mock
 
 import numpy as np
 import torch
@@ -44,36 +48,37 @@ class Ours:
     def __init__(self, sequence: SyntheticSequence, overrides: list[str]) -> None:
         """Map the first frame, then take in the others as keyframes."""
         self.frames = [sequence[SPACING * i] for i in range(6)]
+        self.poses = sequence.ground_truth()[: 6 * SPACING : SPACING]
         first = ["mapping.first_iterations=200", "mapping.every=1000"]
         self.slam = Slam(CAMERA, Config.from_preset("default", [*PAPER, *first, *overrides]), device=None)
         for frame in self.frames[:5]:
             self.slam.step(frame.rgb, frame.depth, T_world_camera=frame.T_world_camera)
         last = self.frames[5]
-        self.slam.scene.cover(*measured_extent(last.depth, last.T_world_camera, self.slam.intrinsics))
-        self.slam._images.set(0, last.rgb, last.depth)
-        self.vector = vector_from_pose(last.T_world_camera)
+        self.slam.scene.cover(*measured_extent(last.depth, self.poses[5], self.slam.intrinsics))
+        self.slam.images.set(0, last.rgb, last.depth)
+        self.vector = vector_from_pose(self.poses[5])
 
     def map_call(self, iterations: int, stage: str | None = None, *, whole: bool = False) -> None:
         """A mapping call; with a stage, all iterations are of that stage (but for the first)."""
-        config = self.slam._mapper.config
+        config = self.slam.mapper.config
         config.iterations = iterations
         config.middle_share, config.fine_share = STAGES[stage] if stage else (0.4, 0.6)
         config.coarse, config.bundle_adjustment = whole, whole
         keyframes = self.slam.keyframes
-        self.slam._mapper.map_frame(self.slam._images, 5, self.vector, keyframes)
+        self.slam.mapper.map_frame(self.slam.images, 5, self.poses[5], keyframes)
 
     def map_first(self, iterations: int) -> None:
         """Iterations of the first frame, at its rates."""
-        config = self.slam._mapper.config
+        config = self.slam.mapper.config
         config.first_iterations, config.coarse = iterations, False
         config.middle_share, config.fine_share = 0.4, 0.6
-        self.slam._mapper.map_first(self.slam._images, 5, self.vector)
+        self.slam.mapper.map_first(self.slam.images, 5, self.poses[5])
 
-    def track(self, optimizer: str, iterations: int) -> None:
+    def track(self, optimizer: Literal["adam", "gauss_newton"], iterations: int) -> None:
         """Tracking with a number of iterations, 200 rays."""
-        config = self.slam._tracker.config
+        config = self.slam.tracker.config
         config.optimizer, config.iterations, config.keep_best = optimizer, iterations, "last"
-        self.slam._tracker.track(self.slam.scene.arrays(), self.slam._images, 5, self.frames[5].T_world_camera)
+        self.slam.tracker.track(self.slam.scene.arrays(), self.slam.images, 5, self.poses[5])
 
 
 def torch_twin(ours: Ours) -> tuple[TorchSlam, dict[str, np.ndarray], TorchSlam]:
@@ -91,18 +96,72 @@ def torch_twin(ours: Ours) -> tuple[TorchSlam, dict[str, np.ndarray], TorchSlam]
     masks = {}
     for level in levels:
         mask = np.zeros(scene.grids[level].row_count, bool)
-        mask[ours.slam._mapper._grids[level].rows.numpy()] = True
+        mask[ours.slam.mapper._grids[level].rows.numpy()] = True
         masks[level] = mask
     decoders = {weights.level: weights for weights in scene.decoder_weights}
-    chosen = [ours.frames[5], *ours.frames[1:5]]
-    images = [(frame.rgb, frame.depth) for frame in chosen]
-    poses = np.stack([vector_from_pose(frame.T_world_camera) for frame in chosen])
+    chosen = (5, 1, 2, 3, 4)
+    images = [(ours.frames[n].rgb, ours.frames[n].depth) for n in chosen]
+    poses = np.stack([vector_from_pose(ours.poses[n]) for n in chosen])
     whole = TorchSlam(levels, decoders, scene.bounds, CAMERA, images, poses)
     alone = TorchSlam(dict(levels), decoders, scene.bounds, CAMERA, images[:1], poses[:1])
     return whole, masks, alone
 
 
-def alternate(pairs: dict[str, tuple[Callable, Callable]], repeats: int) -> dict[str, tuple[float, float]]:
+@dataclass(frozen=True)
+class Phase:
+    """A part of the algorithm in both implementations."""
+
+    ours: Callable[[], object]
+    """The package's."""
+    theirs: Callable[[], object]
+    """torch's."""
+    count: int = 1
+    """Iterations in one call."""
+
+
+def phases_of(ours: Ours, count: int = 10) -> dict[str, Phase]:
+    """What is compared, by name, with ``count`` iterations in a call where single iterations are."""
+    theirs, masks, alone = torch_twin(ours)
+
+    def torch_mapping(stage: str) -> Callable[[], None]:
+        def run() -> None:
+            theirs.start_mapping(masks)
+            for _ in range(count):
+                theirs.map_once(stage, 1000)
+
+        return run
+
+    def torch_call(problem: TorchSlam, iterations: int, factor: float, *, adjust: bool) -> Callable[[], None]:
+        def run() -> None:
+            problem.start_mapping(masks, adjust=adjust)
+            for j in range(iterations):
+                stage = "middle" if j <= 0.4 * iterations else "fine" if j <= 0.6 * iterations else "color"
+                problem.map_once(stage, 1000, factor=factor)
+
+        return run
+
+    def torch_tracking() -> None:
+        alone.start_tracking()
+        for _ in range(count):
+            alone.track_once(200)
+
+    ours.slam.tracker.config.pixels = 200
+    ours.slam.tracker._batch = ours.slam.tracker._new_batch(200)
+    phases = {
+        "tracking, Adam": Phase(lambda: ours.track("adam", count), torch_tracking, count),
+        "tracking, Gauss-Newton": Phase(lambda: ours.track("gauss_newton", count), torch_tracking, count),
+    }
+    for stage in STAGES:
+        phases[f"mapping, {stage}"] = Phase(partial(ours.map_call, count, stage), torch_mapping(stage), count)
+    call, first = torch_call(theirs, 60, 1.0, adjust=True), torch_call(alone, 60, 5.0, adjust=False)
+    phases["mapping call"] = Phase(lambda: ours.map_call(60, whole=True), call)
+    phases["first frame, 60 iterations"] = Phase(lambda: ours.map_first(60), first)
+    return phases
+
+
+def alternate(
+    pairs: dict[str, tuple[Callable[[], object], Callable[[], object]]], repeats: int
+) -> dict[str, tuple[float, float]]:
     """Median seconds of both functions of each pair, run in turns."""
     result = {}
     for name, (ours, theirs) in pairs.items():
@@ -117,24 +176,21 @@ def alternate(pairs: dict[str, tuple[Callable, Callable]], repeats: int) -> dict
     return result
 
 
-def launching_share(ours: Ours, optimizer: str, repeats: int) -> float:
+def launching_share(ours: Ours, optimizer: Literal["adam", "gauss_newton"], repeats: int) -> float:
     """Time of 100 tracking iterations whose kernels have no thread over that of whole ones: medians, in turns."""
     commands: list[wp.Launch] = []
     original = Launcher.command
 
-    def command(self: Launcher, *arguments: object) -> wp.Launch:
-        commands.append(original(self, *arguments))
+    def command(launcher: Launcher, kernel: wp.Kernel, dim: Any, inputs: list) -> wp.Launch:
+        commands.append(original(launcher, kernel, dim, inputs))
         return commands[-1]
 
     def run() -> None:
         ours.track(optimizer, 100)
 
-    ours.slam._tracker._launcher.forget()
-    Launcher.command = command
-    try:
+    ours.slam.tracker._launcher.forget()
+    with mock.patch.object(Launcher, "command", command):
         run()  # records the launches
-    finally:
-        Launcher.command = original
     whole = [recorded.bounds for recorded in commands]
 
     def without_threads() -> None:
@@ -173,47 +229,19 @@ def main(arguments: list[str] | None = None) -> int:
     torch.manual_seed(0)
     sequence = SyntheticSequence(1_000_000, 40, intrinsics=CAMERA)
     ours = Ours(sequence, options.set)
-    theirs, masks, alone = torch_twin(ours)
-    n = 10
-
-    def torch_mapping(stage: str, count: int) -> Callable:
-        def run() -> None:
-            theirs.start_mapping(masks)
-            for _ in range(count):
-                theirs.map_once(stage, 1000)
-
-        return run
-
-    def torch_call(problem: TorchSlam, count: int, factor: float, *, adjust: bool) -> Callable:
-        def run() -> None:
-            problem.start_mapping(masks, adjust=adjust)
-            for j in range(count):
-                stage = "middle" if j <= 0.4 * count else "fine" if j <= 0.6 * count else "color"
-                problem.map_once(stage, 1000, factor=factor)
-
-        return run
-
-    def torch_tracking() -> None:
-        alone.start_tracking()
-        for _ in range(n):
-            alone.track_once(200)
-
-    ours.slam._tracker.config.pixels = 200
-    ours.slam._tracker._batch = ours.slam._tracker._new_batch(200)
-    pairs = {"tracking, Adam": (lambda: ours.track("adam", n), torch_tracking)}
-    pairs["tracking, Gauss-Newton"] = (lambda: ours.track("gauss_newton", n), torch_tracking)
-    for stage in STAGES:
-        pairs[f"mapping, {stage}"] = (lambda stage=stage: ours.map_call(n, stage), torch_mapping(stage, n))
-    pairs["mapping call"] = (lambda: ours.map_call(60, whole=True), torch_call(theirs, 60, 1.0, adjust=True))
-    pairs["first frame, 60 iterations"] = (lambda: ours.map_first(60), torch_call(alone, 60, 5.0, adjust=False))
-    divide = {name: n if name.startswith(("tracking", "mapping, ")) else 1 for name in pairs}
+    phases = phases_of(ours)
+    pairs = {name: (phase.ours, phase.theirs) for name, phase in phases.items()}
     times = alternate(pairs, options.repeats)
     peak = matrix_peak()
-    shares = {optimizer: launching_share(ours, optimizer, options.repeats) for optimizer in ("adam", "gauss_newton")}
+    shares = {
+        "adam": launching_share(ours, "adam", options.repeats),
+        "gauss_newton": launching_share(ours, "gauss_newton", options.repeats),
+    }
     rows = {}
     print("| phase | warpslam [ms] | torch [ms] | ratio |\n|---|---|---|---|")
     for name, (a, b) in times.items():
-        rows[name] = {"warpslam_ms": 1e3 * a / divide[name], "torch_ms": 1e3 * b / divide[name], "ratio": b / a}
+        each = 1e3 / phases[name].count
+        rows[name] = {"warpslam_ms": each * a, "torch_ms": each * b, "ratio": b / a}
         print("| {} | {:.1f} | {:.1f} | {:.1f} |".format(name, *rows[name].values()))
     print(
         f"matrix products: {peak:.0f} GFLOP/s on {options.threads} threads; kernels compiled in "

@@ -62,7 +62,7 @@ class DecoderSet(nn.Module):
         return Decoders(*(getattr(self, level).weights() for level in LEVELS))
 
     def residual(self, points: Tensor, fine: Tensor, middle: Tensor) -> Tensor:
-        """Fine decoder output (N,); the middle feature enters without gradient (paper Eq. 3, SPEC of the order)."""
+        """Fine decoder output (N,); the middle feature enters without gradient (Eq. 3)."""
         return self.fine(points, torch.cat([fine, middle.detach()], dim=1))
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 HELD_OUT_SEED = 1_000_000
 """Rooms with seeds from here on are for evaluation only."""
@@ -61,8 +62,6 @@ def make_samples(room: Any, seed: int, sizes: SampleSizes) -> dict[str, np.ndarr
     points = np.concatenate([near, uniform])
     origins, directions, distances = _cast_views(room, rng, lower, upper, sizes)
     hits = (origins[:, None] + directions * distances[..., None]).reshape(-1, 3)
-    from scipy.spatial import cKDTree
-
     nearest = cKDTree(surface).query(hits, workers=1)[1]
     centre = (lower + upper) / 2
     samples = {

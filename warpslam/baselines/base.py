@@ -10,13 +10,10 @@ import trimesh
 
 from warpslam.camera import Intrinsics
 from warpslam.config import Config
-from warpslam.errors import ConfigError, FrameError
-from warpslam.frames import FrameResult, read_images
-from warpslam.poses import check_transform, pose_from_vector, vector_from_pose
+from warpslam.errors import ConfigError
+from warpslam.frames import AdmittedFrame, FrameResult, admit, skipped
 from warpslam.storage.state_file import StateFields, StateFormat, read_state, write_state
-from warpslam.trajectory import Trajectory
-
-STATUSES = ("OK", "LOST", "SKIPPED")
+from warpslam.trajectory import FrameHistory, HistoryState, Trajectory
 
 
 class Baseline:
@@ -37,15 +34,12 @@ class Baseline:
     ) -> None:
         config = config if config is not None else Config()
         self.intrinsics, self.config, self.seed = intrinsics, config, seed
-        self._vectors: list[np.ndarray] = []
-        self._timestamps: list[float] = []
-        self._status: list[str] = []
+        self.history = FrameHistory()
 
     @property
     def trajectory(self) -> Trajectory:
         """All poses so far."""
-        poses = np.array([pose_from_vector(vector) for vector in self._vectors]).reshape(-1, 4, 4)
-        return Trajectory(np.array(self._timestamps), poses, list(self._status))
+        return self.history.trajectory
 
     def step(
         self,
@@ -57,20 +51,20 @@ class Baseline:
         depth_scale: float | None = None,
     ) -> FrameResult:
         """Take in one frame; arguments and errors are those of `Slam.step`."""
-        index = len(self._vectors)
-        timestamp = index / 30.0 if timestamp is None else float(timestamp)
-        given = None if T_world_camera is None else check_transform(T_world_camera, unknown_is_nan=True)
-        try:
-            rgb, depth = read_images(rgb, depth, self.intrinsics, self.config.grid.max_depth, depth_scale)
-            if given is not None and not np.isfinite(given).all():
-                raise FrameError("its T_world_camera holds NaN or infinity")
-        except FrameError as error:
-            return self._skip(index, timestamp, str(error))
-        return self._step(index, timestamp, rgb, depth, given)
+        frame = admit(
+            len(self.history),
+            rgb,
+            depth,
+            timestamp,
+            T_world_camera,
+            depth_scale=depth_scale,
+            last_timestamp=self.history.last_timestamp,
+            intrinsics=self.intrinsics,
+            config=self.config,
+        )
+        return self._skip(frame) if frame.fault else self._step(frame)
 
-    def _step(
-        self, index: int, timestamp: float, rgb: np.ndarray, depth: np.ndarray, given: np.ndarray | None
-    ) -> FrameResult:
+    def _step(self, frame: AdmittedFrame) -> FrameResult:
         raise NotImplementedError
 
     def refine(self, rounds: int | None = None) -> NoReturn:
@@ -111,15 +105,14 @@ class Baseline:
             CheckpointError: The file can't be written.
         """
         header, arrays = self._state()
+        history = self.history.state()
         header |= {
             "seed": self.seed,
             "config": self.config.model_dump(),
             "intrinsics": vars(self.intrinsics),
-            "status": self._status,
+            "first": history.first,
         }
-        arrays["timestamps"] = np.array(self._timestamps, np.float64)
-        arrays["vectors"] = np.array(self._vectors, np.float64).reshape(-1, 7)
-        write_state(Path(path), self.form, header, arrays)
+        write_state(Path(path), self.form, header, {**arrays, **history.arrays()})
 
     @classmethod
     def load(cls, path: str | Path, device: str | None = None) -> Self:
@@ -131,10 +124,7 @@ class Baseline:
         state = StateFields(str(path), *read_state(Path(path), cls.form))
         camera = state.parsed("intrinsics", lambda fields: Intrinsics(**fields))
         method = cls(camera, state.parsed("config", Config.from_dict), device, state.integer("seed"))
-        method._vectors = list(state.array("vectors", np.float64, (None, 7)).copy())
-        count = len(method._vectors)
-        method._timestamps = state.array("timestamps", np.float64, (count,)).tolist()
-        method._status = state.texts("status", count, STATUSES)
+        method.history = FrameHistory.restored(HistoryState.read(state))
         method._restore(state)
         return method
 
@@ -146,12 +136,6 @@ class Baseline:
         """Take over a map that `_state` described."""
         raise NotImplementedError
 
-    def _append(self, vector: np.ndarray, timestamp: float, status: str) -> None:
-        self._vectors.append(vector)
-        self._timestamps.append(timestamp)
-        self._status.append(status)
-
-    def _skip(self, index: int, timestamp: float, message: str) -> FrameResult:
-        vector = self._vectors[-1].copy() if self._vectors else vector_from_pose(np.eye(4))
-        self._append(vector, timestamp, "SKIPPED")
-        return FrameResult(index, timestamp, pose_from_vector(vector), "SKIPPED", inliers=0.0, message=message)
+    def _skip(self, frame: AdmittedFrame) -> FrameResult:
+        self.history.skip(frame.timestamp)
+        return skipped(frame, self.history.last_pose)

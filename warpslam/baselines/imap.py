@@ -28,18 +28,19 @@ from warpslam.errors import InputError
 from warpslam.field.complexity import flops_per_point, weight_count
 from warpslam.field.rendering import RenderedImage
 from warpslam.field.seeds import ray_seed
-from warpslam.frames import FrameResult
+from warpslam.frames import AdmittedFrame, FrameResult
 from warpslam.kernels import adam, losses, rays
 from warpslam.kernels import imap_density as density
 from warpslam.kernels import imap_network as imap
-from warpslam.meshing import ObservedView, extract_mesh
+from warpslam.meshing import extract_mesh
 from warpslam.poses import check_transform, pose_from_vector, vector_from_pose
 from warpslam.runtime.launching import Launcher, synchronize
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
-from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
+from warpslam.scene.mapped_views import SEEN_STRIDE, ObservedView, SeenDepth
 from warpslam.scene.optimizers import PoseOptimizer, RowOptimizer
 from warpslam.storage.state_file import StateFields, StateFormat
+from warpslam.trajectory import Located
 
 if TYPE_CHECKING:
     import trimesh
@@ -94,36 +95,39 @@ class Imap(Baseline):
 
     # -- the algorithm -------------------------------------------------------------------------------------------
 
-    def _step(
-        self, index: int, timestamp: float, rgb: np.ndarray, depth: np.ndarray, given: np.ndarray | None
-    ) -> FrameResult:
-        if self.config.tracking.use_given_poses and given is None:
-            raise InputError(f"frame {index}: tracking.use_given_poses is on, but step() got no T_world_camera")
+    def _step(self, frame: AdmittedFrame) -> FrameResult:
+        index, depth, given = frame.index, frame.depth, frame.given_pose
         scale = self._settings.scale
-        self._images.set(0, rgb, depth * np.float32(scale))
+        self._images.set(0, frame.rgb, depth * np.float32(scale))
         self._current = index
         timings: dict[str, float] = {}
         values: dict[str, float] = {}
-        inliers, depth_error = 1.0, 0.0
         first = not self._seen
         if first or self.config.tracking.use_given_poses:
-            vector = vector_from_pose(np.eye(4) if given is None else given)
+            located = Located(np.eye(4) if given is None else given)
         else:
             start = time.perf_counter()
-            vector, loss, depth_error, inliers = self._track(index)
-            values["tracking"] = loss
+            located, values["tracking"] = self._track(index)
             timings["tracking"] = time.perf_counter() - start
-        self._append(vector, timestamp, "OK")
+        self.history.add(frame.timestamp, located)
         if first or index % self.config.mapping.every == 0:
             start = time.perf_counter()
             values["mapping"] = self._map(index, depth, first)
             synchronize(self.device)
             timings["mapping"] = time.perf_counter() - start
         if not self.keyframes or index - self.keyframes[-1].index >= self.config.keyframes.every:
-            image = self._images.add(rgb, depth * np.float32(scale))
-            self.keyframes.append(Keyframe(index, image, self._vectors[index].copy()))
-        T = pose_from_vector(vector)
-        return FrameResult(index, timestamp, T, "OK", values, inliers, depth_error, timings)
+            image = self._images.add(frame.rgb, depth * np.float32(scale))
+            self.keyframes.append(Keyframe(index, image, self.history.pose(index)))
+        return FrameResult(
+            index,
+            frame.timestamp,
+            self.history.pose(index),
+            located.status,
+            values,
+            located.inliers,
+            located.depth_error,
+            timings,
+        )
 
     def finish(self) -> dict[str, float]:
         """Map the last frame if it was not, then train on a doubled window. Returns the seconds by phase."""
@@ -133,7 +137,7 @@ class Imap(Baseline):
             return timings
         if self._mapped != index:
             start = time.perf_counter()
-            self._map(index, self._images.depth_image(0) / np.float32(settings.scale), first=False)
+            self._map(index, self._images.current_depth() / np.float32(settings.scale), first=False)
             timings["mapping"] = time.perf_counter() - start
         if self.config.mapping.color_refinement:
             start = time.perf_counter()
@@ -143,9 +147,9 @@ class Imap(Baseline):
             timings["refinement"] = time.perf_counter() - start
         return timings
 
-    def _track(self, index: int) -> tuple[np.ndarray, float, float, float]:
-        """Pose vector [m], mean loss, mean depth error [m] and share of the rays with depth that are kept."""
-        start = self._scaled(self._initial_vector())
+    def _track(self, index: int) -> tuple[Located, float]:
+        """The camera, and the mean loss; inliers are the share of the rays with depth that are kept."""
+        start = self._scaled(vector_from_pose(self.history.starts(self.config.tracking.constant_speed)[0]))
         settings, batch = self._settings, self._tracking
         iterations = settings.tracking_iterations
         decay = self.config.tracking.final_rate_factor ** np.linspace(0.0, 1.0, iterations)[:, None]
@@ -167,7 +171,7 @@ class Imap(Baseline):
         candidates = [vector for vector in candidates if np.isfinite(vector).all()]
         return min((self._judge(index, vector) for vector in candidates), key=lambda result: result[1])
 
-    def _judge(self, index: int, vector: np.ndarray) -> tuple[np.ndarray, float, float, float]:
+    def _judge(self, index: int, vector: np.ndarray) -> tuple[Located, float]:
         """`_track`'s result for a pose, on pixels that are the same for all of a frame's."""
         batch = self._tracking
         self._poses.begin(vector[None])
@@ -176,12 +180,13 @@ class Imap(Baseline):
         measured = batch.measured_depth.numpy()[: batch.count]
         inlier = batch.inlier.numpy()[: batch.count] != 0
         count = int(inlier.sum())
-        metres = self._scaled(vector, 1.0 / self._settings.scale)
+        pose = pose_from_vector(self._scaled(vector, 1.0 / self._settings.scale))
         if not count:
-            return metres, np.inf, np.inf, 0.0
+            return Located(pose, inliers=0.0, depth_error=np.inf), np.inf
         error = np.abs(measured - batch.depth.numpy()[: batch.count])[inlier].mean() / self._settings.scale
         loss = float(batch.loss.numpy()[0]) / count
-        return metres, loss if np.isfinite(loss) else np.inf, float(error), count / int((measured > 0).sum())
+        located = Located(pose, inliers=count / int((measured > 0).sum()), depth_error=float(error))
+        return located, loss if np.isfinite(loss) else np.inf
 
     def _tracking_loss(self, wanted: Wanted | None = None, tape: wp.Tape | None = None) -> None:
         config, batch, bound = self.config.tracking, self._tracking, self._bound
@@ -192,13 +197,6 @@ class Imap(Baseline):
         batch.evaluate(self.network, bound, wanted, tape, jitter=self.config.sampling.jitter)
         batch.choose_inliers(0.0)
         batch.tracking_loss(TRACKING_COLOR_WEIGHT)
-
-    def _initial_vector(self) -> np.ndarray:
-        """Constant speed (if on and known), else the last pose [m]."""
-        last = pose_from_vector(self._vectors[-1])
-        if self.config.tracking.constant_speed and self._status[-2:] == ["OK", "OK"]:
-            last = last @ np.linalg.inv(pose_from_vector(self._vectors[-2])) @ last
-        return vector_from_pose(last)
 
     def _map(self, index: int, depth: np.ndarray, first: bool) -> float:
         """Train on the frame and on keyframes; the mean loss a ray of the last iteration."""
@@ -245,8 +243,8 @@ class Imap(Baseline):
             *others, last = self.keyframes
             rng = np.random.default_rng([self.seed, _MAPPING, index, round_])
             chosen = [others[n] for n in rng.permutation(len(others))[: max(size - 2, 0)]] + [last]
-        vectors = [*(keyframe.pose for keyframe in chosen), self._vectors[index]]
-        poses = np.stack([self._scaled(vector) for vector in vectors]).astype(np.float32)
+        matrices = [*(keyframe.pose for keyframe in chosen), self.history.pose(index)]
+        poses = np.stack([self._scaled(vector_from_pose(T)) for T in matrices]).astype(np.float32)
         slots = [*self._images.bring([keyframe.image for keyframe in chosen]), 0]
         return wp.array(slots, dtype=int, device=self.device), wp.array(poses, dtype=float, device=self.device)
 
@@ -273,8 +271,7 @@ class Imap(Baseline):
         return np.concatenate([vector[:4], vector[4:] * (self._settings.scale if scale is None else scale)])
 
     def _view(self, seen: SeenDepth) -> ObservedView:
-        camera = self.intrinsics.strided(SEEN_STRIDE)
-        return ObservedView(seen.depth(), camera, pose_from_vector(self._vectors[seen.index]))
+        return seen.view(self.intrinsics, self.history.pose(seen.index))
 
     # -- what came out -------------------------------------------------------------------------------------------
 
@@ -367,7 +364,7 @@ class Imap(Baseline):
 
     def _restore(self, state: StateFields) -> None:
         camera = self.intrinsics.strided(SEEN_STRIDE)
-        frames = state.frames("seen", len(self._vectors))
+        frames = state.frames("seen", len(self.history))
         depths = state.array("seen", np.uint16, (len(frames), camera.height, camera.width))
         self._seen = [SeenDepth(index, millimetres) for index, millimetres in zip(frames, depths, strict=True)]
         if frames:

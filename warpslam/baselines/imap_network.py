@@ -8,7 +8,8 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from warpslam.field.decoders import EMBEDDING_SCALE, EMBEDDING_SIZE
+from warpslam.field.complexity import imap_shapes
+from warpslam.field.decoders import EMBEDDING_SCALE
 from warpslam.field.ray_batch import RayBatch
 from warpslam.kernels import imap_density as density
 from warpslam.kernels import imap_network as imap
@@ -253,19 +254,3 @@ class ImapBatch(RayBatch):
 def _channels(x: wp.array) -> wp.array:
     """The same memory with the 32 channels of a `Vec32` as a third axis."""
     return wp.array(ptr=x.ptr, dtype=float, shape=(*x.shape, 32), device=x.device, copy=False)
-
-
-IMAP_HIDDEN = 256
-IMAP_LAYERS = 4
-IMAP_OUTPUTS = 4  # red, green, blue, density
-
-
-def imap_shapes() -> dict[str, tuple[int, ...]]:
-    """Name and shape, (out, in), of every tensor of the network of iMAP*."""
-    shapes: dict[str, tuple[int, ...]] = {"embedder._B": (3, EMBEDDING_SIZE)}
-    for k in range(IMAP_LAYERS):
-        shapes[f"pts_linears.{k}.weight"] = (IMAP_HIDDEN, EMBEDDING_SIZE if k == 0 else IMAP_HIDDEN)
-        shapes[f"pts_linears.{k}.bias"] = (IMAP_HIDDEN,)
-    shapes["output_linear.weight"] = (IMAP_OUTPUTS, IMAP_HIDDEN)
-    shapes["output_linear.bias"] = (IMAP_OUTPUTS,)
-    return shapes

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -20,9 +21,10 @@ from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.errors import InputError, MeshError, MissingDependencyError
 from warpslam.field.rendering import RenderedImage
-from warpslam.frames import FrameResult
-from warpslam.poses import check_transform, vector_from_pose
+from warpslam.frames import AdmittedFrame, FrameResult
+from warpslam.poses import check_transform
 from warpslam.storage.state_file import StateFields, StateFormat
+from warpslam.trajectory import Located
 
 BLOCK_VOXELS = 16
 BYTES_PER_VOXEL = 12
@@ -81,24 +83,24 @@ class Tsdf(Baseline):
             raise InputError(f"device = {device!r}: Open3D can't use it ({error}); use cpu") from error
         self._camera = core.Tensor(intrinsics.matrix)
 
-    def _step(
-        self, index: int, timestamp: float, rgb: np.ndarray, depth: np.ndarray, given: np.ndarray | None
-    ) -> FrameResult:
-        if given is None:
-            return self._skip(index, timestamp, "no pose is given, and TSDF fusion can't track")
+    def _step(self, frame: AdmittedFrame) -> FrameResult:
+        if frame.given_pose is None:
+            return self._skip(replace(frame, fault="no pose is given, and TSDF fusion can't track"))
         start = time.perf_counter()
         for name in ("_surface", "_scene"):
             self.__dict__.pop(name, None)
         image = self._o3d.t.geometry.Image
-        depth_image, rgb_image = image(self._tensor(depth)), image(self._tensor(rgb.astype(np.float32) / 255.0))
+        depth_image = image(self._tensor(frame.depth))
+        rgb_image = image(self._tensor(frame.rgb.astype(np.float32) / 255.0))
         # Open3D wants cameras on the CPU, whatever the device of the volume.
-        extrinsic = self._o3d.core.Tensor(np.linalg.inv(given))
+        extrinsic = self._o3d.core.Tensor(np.linalg.inv(frame.given_pose))
         limits = (1.0, self.config.grid.max_depth, self.config.tsdf.truncation_voxels)
         with self._quiet():
             blocks = self._grid.compute_unique_block_coordinates(depth_image, self._camera, extrinsic, *limits)
             self._grid.integrate(blocks, depth_image, rgb_image, self._camera, self._camera, extrinsic, *limits)
-        self._append(vector_from_pose(given), timestamp, "OK")
-        return FrameResult(index, timestamp, given, timings={"mapping": time.perf_counter() - start})
+        self.history.add(frame.timestamp, Located(frame.given_pose))
+        timings = {"mapping": time.perf_counter() - start}
+        return FrameResult(frame.index, frame.timestamp, frame.given_pose, timings=timings)
 
     def finish(self) -> dict[str, float]:
         """Nothing is left to do."""

@@ -59,7 +59,7 @@ def convergence(job: Job) -> dict[str, Any]:
     from warpslam.frames import read_images
     from warpslam.mapping.frustum import measured_extent
     from warpslam.mapping.mapper import Mapper
-    from warpslam.poses import vector_from_pose
+    from warpslam.poses import orthonormalized
     from warpslam.scene.image_pool import ImagePool
     from warpslam.scene.scene_map import SceneMap
 
@@ -91,7 +91,7 @@ def convergence(job: Job) -> dict[str, Any]:
         curve.append([iteration + 1, error])
 
     note(None, -1, mapping.first_iterations)
-    mapper.map_first(images, 0, vector_from_pose(T_world_camera), note)
+    mapper.map_first(images, 0, orthonormalized(T_world_camera), note)
     return {"figures": {"view_depth": curve[-1][1]}, "curve": curve}
 
 
@@ -123,7 +123,7 @@ def outside_change(job: Job) -> dict[str, Any]:
     def snapshot(level: str) -> FeatureGrid:
         grid = slam.scene.grids[level]
         copy = FeatureGrid(level, grid.spacing, grid.std, slam.seed, device)
-        copy.restore(grid.first, grid.shape, grid.features.numpy(), grid.seen.numpy())
+        copy.restore(grid.state())
         return copy
 
     for number, (frame, T_world_camera) in enumerate(islice(frames, 1 + MAPPING_CALLS * every)):
@@ -134,7 +134,7 @@ def outside_change(job: Job) -> dict[str, Any]:
             continue
         # The depth as the mapper has it, rounded.
         images.set(0, *read_images(frame.rgb, frame.depth, camera, config.grid.max_depth, None))
-        depth = wp.array(images.depth_image(0), dtype=float, device=device)
+        depth = images.metres()
         for level, old in before.items():
             grid = slam.scene.grids[level]
             old.update_from(grid, None)

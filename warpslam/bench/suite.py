@@ -28,7 +28,7 @@ class _Section(BaseModel):
 
 
 class Rendering(_Section):
-    """A synthetic sequence that the bench renders itself; as ``python -m warpslam.synthetic sequence``."""
+    """A synthetic sequence that the bench renders itself; as ``warpslam render-room sequence``."""
 
     kind: Literal["room", "moving", "gap"]
     seed: int = Field(0, ge=0)

@@ -1,20 +1,38 @@
-"""The ``warpslam`` command: a module for each command, which reads arguments, calls the library and prints."""
+"""The ``warpslam`` command: a module for each command, which reads arguments, calls the library and prints.
+
+The module of a command is imported when that command is asked for, so that ``warpslam --help`` and the light commands
+wait for neither torch nor Warp.
+"""
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import os
 import shlex
 import sys
 from collections.abc import Sequence
 
 from warpslam import __version__
-from warpslam.cli import batch, bench, check, evaluate, info, mesh, profile, render, report, run, warmup
-from warpslam.cli.common import EXIT_ERROR, EXIT_INTERRUPTED
+from warpslam.cli.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED
 from warpslam.errors import WarpSlamError
 
-COMMANDS = (run, batch, bench, check, evaluate, report, render, mesh, profile, warmup, info)
-"""Modules with a function ``add(commands)``, in the order of ``warpslam --help``."""
+COMMANDS = {
+    "run": ("run", "trajectory and coloured mesh of a folder of RGB-D frames"),
+    "demo": ("run", "SLAM in a small rendered room; needs no data"),
+    "batch": ("batch", "run many sequences, and go on where an earlier batch stopped"),
+    "bench": ("bench", "the paper's studies on your sequences: tables, plots and a page"),
+    "check": ("check", "whether a folder of RGB-D frames can be used, before a run"),
+    "eval": ("evaluate", "trajectory and reconstruction errors of a run"),
+    "report": ("report", "HTML report of a run, or a comparison of several"),
+    "render": ("render", "a frame beside what the map renders at its pose, as PNG"),
+    "mesh": ("mesh", "extract the mesh of a run again"),
+    "profile": ("profile", "time of every kernel of a run; writes no run folder"),
+    "render-room": ("render_room", "rendered rooms: RGB-D sequences with their truth, and pictures"),
+    "warmup": ("warmup", "compile all kernels ahead of the first run"),
+    "info": ("info", "versions, devices, decoders, dataset formats and presets"),
+}
+"""Commands in the order of ``warpslam --help``: the module here whose ``add(commands)`` adds them, and what they do."""
 
 
 def entry_point() -> None:
@@ -24,8 +42,9 @@ def entry_point() -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code: 0, 2 after an error in the input, 130 after ctrl-C."""
-    options = _parser().parse_args(arguments)
-    options.command_line = shlex.join(["warpslam", *(sys.argv[1:] if arguments is None else arguments)])
+    arguments = sys.argv[1:] if arguments is None else arguments
+    options = _parser(arguments).parse_args(arguments)
+    options.command_line = shlex.join(["warpslam", *arguments])
     try:
         code = options.command(options)
         sys.stdout.flush()
@@ -48,12 +67,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_INTERRUPTED
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
+    """The parser with the options of the command that is asked for, and of the others their names alone."""
     parser = argparse.ArgumentParser(
         prog="warpslam", description="Dense RGB-D SLAM with a neural implicit map (NICE-SLAM) in NVIDIA Warp."
     )
     parser.add_argument("--version", action="version", version=f"warpslam {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for module in COMMANDS:
-        module.add(commands)
+    wanted, _ = COMMANDS.get(next((word for word in arguments if not word.startswith("-")), ""), ("", ""))
+    for name, (module, text) in COMMANDS.items():
+        if name in commands.choices:
+            continue  # a module may add several commands
+        if module == wanted:
+            importlib.import_module(f"{__name__}.{module}").add(commands)
+        else:
+            commands.add_parser(name, help=text)
     return parser

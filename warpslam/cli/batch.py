@@ -10,7 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from warpslam.cli.common import EXIT_INTERRUPTED, add_command, add_method_option, add_run_options, parse_frames
+from warpslam.cli.common import (
+    EXIT_INTERRUPTED,
+    add_command,
+    add_format_options,
+    add_method_option,
+    add_run_options,
+    parse_frames,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -31,8 +38,7 @@ def add(commands: Any) -> None:
     batch.add_argument("--workers", type=int, metavar="N", help="sequences at a time (1; on a cluster: what fits)")
     batch.add_argument("--memory-gb", type=float, metavar="GB", help="stop a worker that takes more memory than this")
     batch.add_argument("--cluster", metavar="ADDRESS", help="run on Ray: ray://HOST:10001, or local")
-    batch.add_argument("--dataset", default="auto", help="format of the folders (default: told from their file names)")
-    batch.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
+    add_format_options(batch)
     batch.add_argument("--preset", help="settings to start from (default: each dataset's)")
     batch.add_argument("--frames", type=parse_frames, default=slice(None), metavar="A:B:STEP", help="frames to use")
     add_method_option(batch)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from warpslam.batch.status import BatchState
+from warpslam.bench.jobs import Entry, expand, unique_jobs
+from warpslam.bench.results import RUNS
+from warpslam.bench.runner import run_bench
+from warpslam.bench.suite import read_suite
 from warpslam.cli.batch import EXIT_UNFINISHED, progress
-from warpslam.cli.common import EXIT_INTERRUPTED, add_command
-
-if TYPE_CHECKING:
-    from warpslam.bench.jobs import Entry
+from warpslam.cli.common import add_command, quiet_warp
+from warpslam.cli.exit_codes import EXIT_INTERRUPTED
 
 
 def add(commands: Any) -> None:
@@ -29,11 +32,6 @@ def add(commands: Any) -> None:
 
 
 def _bench(options: argparse.Namespace) -> int:
-    from warpslam.bench.jobs import expand
-    from warpslam.bench.runner import run_bench
-    from warpslam.bench.suite import read_suite
-    from warpslam.cli.common import quiet_warp
-
     suite = read_suite(options.suite, *options.data)
     output = Path(options.output or Path("bench") / suite.name)
     studies = [name.strip() for name in options.studies.split(",")] if options.studies else None
@@ -57,10 +55,6 @@ def _bench(options: argparse.Namespace) -> int:
 
 
 def _print_list(entries: list[Entry], output: Path) -> None:
-    from warpslam.batch.status import BatchState
-    from warpslam.bench.jobs import unique_jobs
-    from warpslam.bench.results import RUNS
-
     seeds: dict[tuple[str, str, str], list[str]] = {}
     for entry in entries:
         seeds.setdefault((entry.study.name, entry.sequence, entry.variant.name), []).append(str(entry.seed))

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from warpslam.cli.common import add_command
+from warpslam.cli.common import add_command, add_format_options
+from warpslam.sequences.checking import THOROUGH_SAMPLES, check_folder
+from warpslam.storage.json_files import to_json
 
 EXIT_FINDINGS = 1
 
@@ -14,16 +16,12 @@ def add(commands: Any) -> None:
     """Add the command."""
     check = add_command(commands, "check", _check, "whether a folder of RGB-D frames can be used, before a run")
     check.add_argument("folder", metavar="FOLDER", help="folder of one sequence")
-    check.add_argument("--dataset", default="auto", help="format of the folder (default: told from its file names)")
-    check.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
+    add_format_options(check)
     check.add_argument("--all", action="store_true", help="read every frame, not a sample of them")
     check.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _check(options: argparse.Namespace) -> int:
-    from warpslam.sequences.checking import THOROUGH_SAMPLES, check_folder
-    from warpslam.storage.json_files import to_json
-
     count = None if options.all else THOROUGH_SAMPLES
     report = check_folder(options.folder, options.dataset, options.camera, sample_count=count)
     if options.json:

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import argparse
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from warpslam.cli.exit_codes import EXIT_INTERRUPTED as EXIT_INTERRUPTED
+from warpslam.errors import ConfigError
 from warpslam.pipeline.methods import DEFAULT_METHOD, METHODS
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-EXIT_ERROR = 2
-EXIT_INTERRUPTED = 130
+from warpslam.runs.request import parse_slice
 
 
 def add_command(commands: Any, name: str, function: Callable[[argparse.Namespace], int], text: str) -> Any:
@@ -27,10 +24,20 @@ def add_command(commands: Any, name: str, function: Callable[[argparse.Namespace
 
 def add_sequence_options(parser: argparse.ArgumentParser) -> None:
     """How to read a folder, and which frames and settings to use."""
-    parser.add_argument("--dataset", default="auto", help="format of the folder (default: told from its file names)")
-    parser.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
+    add_format_options(parser)
     parser.add_argument("--preset", help="settings to start from (default: the dataset's)")
     parser.add_argument("--frames", type=parse_frames, metavar="A:B:STEP", help="frames to use, as in a Python slice")
+
+
+def add_format_options(parser: argparse.ArgumentParser) -> None:
+    """How to read a folder."""
+    parser.add_argument("--dataset", default="auto", help="format of the folder (default: told from its file names)")
+    parser.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
+
+
+def add_device_option(parser: argparse.ArgumentParser) -> None:
+    """Where Warp computes."""
+    parser.add_argument("--device", help="cpu, cuda:0, ... (default: a GPU if there is one)")
 
 
 def add_run_options(parser: argparse.ArgumentParser, output: str = "run folder (default: runs/NAME/TIME)") -> None:
@@ -46,7 +53,7 @@ def add_slam_options(parser: argparse.ArgumentParser) -> None:
         help="settings, such as mapping.iterations=30",
     )  # fmt: skip
     parser.add_argument("--decoders", metavar="FILE", help="decoder checkpoint (default: the package's own)")
-    parser.add_argument("--device", help="cpu, cuda:0, ... (default: a GPU if there is one)")
+    add_device_option(parser)
     parser.add_argument("--seed", type=int, default=0, help="seed of every random choice (0)")
 
 
@@ -57,9 +64,6 @@ def add_method_option(parser: argparse.ArgumentParser) -> None:
 
 def parse_frames(text: str) -> slice:
     """A slice of frames from A:B or A:B:STEP."""
-    from warpslam.errors import ConfigError
-    from warpslam.runs.request import parse_slice
-
     try:
         return slice(*parse_slice(text))
     except ConfigError as error:

@@ -5,7 +5,11 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from warpslam.cli.common import add_command, print_reconstruction, print_rendering, quiet_warp
+from warpslam.cli.common import add_command, add_device_option, print_reconstruction, print_rendering, quiet_warp
+from warpslam.evaluation import DEFAULT_PROTOCOL, PROTOCOLS
+from warpslam.pipeline.finished import evaluate_run
+from warpslam.runs.folder import RunFolder
+from warpslam.storage.json_files import to_json
 
 
 def add(commands: Any) -> None:
@@ -25,16 +29,11 @@ def add(commands: Any) -> None:
     evaluate.add_argument(
         "--views", type=int, default=0, metavar="N", help="render N frames in full for PSNR, SSIM and depth L1 (0)"
     )
-    evaluate.add_argument("--device", help="cpu, cuda:0, ... (default: a GPU if there is one)")
+    add_device_option(evaluate)
     evaluate.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _eval(options: argparse.Namespace) -> int:
-    from warpslam.evaluation import DEFAULT_PROTOCOL, PROTOCOLS
-    from warpslam.pipeline.finished import evaluate_run
-    from warpslam.runs.folder import RunFolder
-    from warpslam.storage.json_files import to_json
-
     quiet_warp()
     # The default comes first, so that "reconstruction" is of the same protocol with and without the others.
     protocols = [options.protocol or DEFAULT_PROTOCOL]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from warpslam.cli.common import add_command, quiet_warp
+from warpslam.cli.common import add_command, add_device_option, quiet_warp
 
 _DEFAULT_ROUNDS = 5
 
@@ -20,7 +20,7 @@ def add(commands: Any) -> None:
         "--refine", type=int, nargs="?", const=_DEFAULT_ROUNDS, default=0, metavar="N",
         help=f"refine the whole map before, in N more rounds ({_DEFAULT_ROUNDS}); the saved map stays as it is",
     )  # fmt: skip
-    mesh.add_argument("--device", help="cpu, cuda:0, ... (default: a GPU if there is one)")
+    add_device_option(mesh)
     mesh.add_argument(
         "-o", "--output", metavar="FILE",
         help=".ply or .glb file (default: RUN/mesh.ply, or RUN/mesh_forecast.ply with --forecast)",

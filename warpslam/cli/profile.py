@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from rich.console import Console
 
 from warpslam.cli.common import add_command, add_sequence_options, add_slam_options, quiet_warp, warnings_on_stderr
-
-if TYPE_CHECKING:
-    from warpslam.config import Config
-    from warpslam.profiling.recorder import Profile
-    from warpslam.sequences.base import RgbdSequence
+from warpslam.config import Config
+from warpslam.errors import ConfigError, MeshError
+from warpslam.pipeline.finished import open_source
+from warpslam.pipeline.setup import build_slam, load_kernels, select_frames
+from warpslam.profiling.session import Profile
+from warpslam.runs.request import Source
+from warpslam.runtime.phases import phase
+from warpslam.sequences.base import RgbdSequence
+from warpslam.synthetic import demo
 
 _MIN_SHARE = 0.002
 
@@ -29,11 +35,6 @@ def add(commands: Any) -> None:
 
 
 def _profile(options: argparse.Namespace) -> int:
-    from rich.console import Console
-
-    from warpslam.errors import ConfigError
-    from warpslam.pipeline.setup import select_frames
-
     quiet_warp()
     for option, file in (("--json", options.json), ("--trace", options.trace)):
         if file and not Path(file).resolve().parent.is_dir():
@@ -61,11 +62,6 @@ def _profile(options: argparse.Namespace) -> int:
 
 
 def _input(options: argparse.Namespace) -> tuple[RgbdSequence, Config]:
-    from warpslam.config import Config
-    from warpslam.pipeline.finished import open_source
-    from warpslam.runs.request import Source
-    from warpslam.synthetic import demo
-
     if options.folder == "demo":
         preset, overrides = options.preset or demo.PRESET, [*demo.OVERRIDES, *options.overrides]
         return open_source(Source(None)), Config.from_preset(preset, overrides)
@@ -75,12 +71,7 @@ def _input(options: argparse.Namespace) -> tuple[RgbdSequence, Config]:
 
 
 def _run(sequence: RgbdSequence, config: Config, selected: range, options: argparse.Namespace) -> Profile:
-    from warpslam import profile
-    from warpslam.errors import MeshError
-    from warpslam.pipeline.setup import build_slam, load_kernels
-    from warpslam.runtime.phases import phase
-
-    with profile() as result:
+    with Profile() as result:
         with phase("setup"):
             load_kernels(sequence, options.device)
             slam = build_slam(sequence.intrinsics, config, options.device, options.seed)

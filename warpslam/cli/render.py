@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from warpslam.cli.common import add_command, quiet_warp
+from warpslam.cli.common import add_command, add_device_option, quiet_warp
 
 
 def add(commands: Any) -> None:
@@ -13,7 +13,7 @@ def add(commands: Any) -> None:
     render = add_command(commands, "render", _render, "a frame beside what the map renders at its pose, as PNG")
     render.add_argument("run", metavar="RUN", help="run folder")
     render.add_argument("--frame", type=int, required=True, metavar="N", help="number of the frame in its sequence")
-    render.add_argument("--device", help="cpu, cuda:0, ... (default: a GPU if there is one)")
+    add_device_option(render)
     render.add_argument("-o", "--output", metavar="FILE", help="PNG file (default: RUN/render_N.png)")
 
 

@@ -6,6 +6,8 @@ import argparse
 from typing import Any
 
 from warpslam.cli.common import add_command, quiet_warp
+from warpslam.report import write_comparison, write_report
+from warpslam.runs.folder import RunFolder
 
 
 def add(commands: Any) -> None:
@@ -18,9 +20,6 @@ def add(commands: Any) -> None:
 
 
 def _report(options: argparse.Namespace) -> int:
-    from warpslam.report import write_comparison, write_report
-    from warpslam.runs.folder import RunFolder
-
     quiet_warp()
     folders = [RunFolder.open(run) for run in options.runs]
     if len(folders) == 1:

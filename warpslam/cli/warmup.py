@@ -5,12 +5,14 @@ from __future__ import annotations
 import argparse
 import re
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import warp as wp
 
 from warpslam.cli.common import add_command, quiet_warp
-
-if TYPE_CHECKING:
-    from warpslam.runtime.compilation import ModuleProgress
+from warpslam.pipeline.setup import check_device
+from warpslam.runtime.compilation import ModuleProgress, compile_for_architecture, compile_kernels
+from warpslam.synthetic import RenderedSequence
 
 _EXPLANATION = """
 For cpu, cuda or cuda:N the kernels are compiled and loaded here, exactly as the first run would do it; runs on this
@@ -33,12 +35,6 @@ def add(commands: Any) -> None:
 
 
 def _warmup(options: argparse.Namespace) -> int:
-    import warp as wp
-
-    from warpslam.pipeline.setup import check_device
-    from warpslam.runtime.compilation import compile_for_architecture, compile_kernels
-    from warpslam.synthetic.sequence import RenderedSequence
-
     quiet_warp()
     start = time.perf_counter()
     extra = RenderedSequence.warp_modules

@@ -9,8 +9,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from warpslam.baselines.imap_network import imap_shapes
-from warpslam.field.decoders import LEVELS, MAX_HIDDEN, expected_shapes
+from warpslam.field.decoders import EMBEDDING_SIZE, LEVELS, MAX_HIDDEN, expected_shapes
+
+IMAP_HIDDEN = 256
+IMAP_LAYERS = 4
+IMAP_OUTPUTS = 4  # red, green, blue, density
+
+
+def imap_shapes() -> dict[str, tuple[int, ...]]:
+    """Name and shape, (out, in), of every tensor of the network of iMAP*."""
+    shapes: dict[str, tuple[int, ...]] = {"embedder._B": (3, EMBEDDING_SIZE)}
+    for k in range(IMAP_LAYERS):
+        shapes[f"pts_linears.{k}.weight"] = (IMAP_HIDDEN, EMBEDDING_SIZE if k == 0 else IMAP_HIDDEN)
+        shapes[f"pts_linears.{k}.bias"] = (IMAP_HIDDEN,)
+    shapes["output_linear.weight"] = (IMAP_OUTPUTS, IMAP_HIDDEN)
+    shapes["output_linear.bias"] = (IMAP_OUTPUTS,)
+    return shapes
 
 
 def decoder_shapes(level: str, hidden: int = MAX_HIDDEN) -> dict[str, tuple[int, ...]]:

@@ -20,16 +20,16 @@ from warpslam.field.seeds import ray_seed
 from warpslam.mapping.active_sampling import CellErrors
 from warpslam.mapping.depth_start import DepthStart
 from warpslam.mapping.frustum import mark_seen, select_in_frustum
+from warpslam.mapping.window import overlapping_window, random_window
 from warpslam.poses import pose_from_vector, vector_from_pose
 from warpslam.runtime.launching import Launcher
-from warpslam.runtime.phases import phase
 from warpslam.scene.feature_grid import LEVELS
 from warpslam.scene.image_pool import ImagePool
-from warpslam.scene.keyframes import Keyframe, overlap_fractions
+from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.optimizers import ColorDecoderOptimizer, GridOptimizer, PoseOptimizer
 from warpslam.scene.scene_map import SceneMap
 
-# What each stage optimises, and at which of the configured rates (SPEC of the released code, learning rates by stage).
+# What each stage optimises; the learning rates by stage are those of the authors' released code.
 _STAGE_LEVELS = {
     "coarse": ("coarse",),
     "middle": ("middle",),
@@ -43,18 +43,38 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class MappingResult:
-    """Outcome of one mapping call.
+    """Outcome of one mapping call."""
 
-    vector: Pose vector of the current frame, refined if bundle adjustment ran.
-    losses: Mean loss per kept ray in the last iteration of each stage.
-    window: Frame numbers of the keyframes that took part.
-    adjusted: Whether poses were refined.
-    """
-
-    vector: np.ndarray
+    pose: np.ndarray
+    """T_world_camera of the current frame (4, 4), refined if bundle adjustment ran."""
     losses: dict[str, float] = field(default_factory=dict)
+    """Mean loss per kept ray in the last iteration of each stage."""
     window: list[int] = field(default_factory=list)
+    """Frame numbers of the keyframes that took part."""
     adjusted: bool = False
+    """Whether poses were refined."""
+
+
+@dataclass
+class _Call:
+    """One mapping call."""
+
+    frame: int
+    """Number of the current frame."""
+    pose: np.ndarray
+    """Of the current frame, before bundle adjustment (4, 4)."""
+    rate_factor: float
+    """Of all learning rates of features."""
+    adjust: bool
+    """Whether poses are refined."""
+    refinement: bool
+    """Whether it is the final refinement (Sec. 3.1)."""
+    round: int
+    """Number of the refinement's round."""
+    window: list[Keyframe] = field(default_factory=list)
+    """Keyframes that take part, the oldest first."""
+    ray_counts: dict[str, int] = field(default_factory=dict)
+    """Rays of an iteration, by stages that have run."""
 
 
 class Mapper:
@@ -94,45 +114,45 @@ class Mapper:
         self._frozen = {level for level, is_optimized in wanted.items() if not is_optimized}
 
     def map_first(
-        self, images: ImagePool, frame: int, vector: np.ndarray, on_iteration: Callable | None = None
+        self, images: ImagePool, frame: int, pose: np.ndarray, on_iteration: Callable | None = None
     ) -> MappingResult:
         """The first frame: many iterations at higher rates."""
-        return self.start_first(images, frame, vector, on_iteration)()
+        return self.start_first(images, frame, pose, on_iteration)()
 
-    def map_frame(self, images: ImagePool, frame: int, vector: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
+    def map_frame(self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
         """A later frame: window, frustum selection, three stages, bundle adjustment once there are enough keyframes."""
-        return self.start_frame(images, frame, vector, keyframes)()
+        return self.start_frame(images, frame, pose, keyframes)()
 
     def start_first(
-        self, images: ImagePool, frame: int, vector: np.ndarray, on_iteration: Callable | None = None
+        self, images: ImagePool, frame: int, pose: np.ndarray, on_iteration: Callable | None = None
     ) -> Callable[[], MappingResult]:
         """`map_first` without waiting for the device: the function that is returned waits, and reads the outcome."""
         config = self.config
         return self._optimize(
-            images, frame, vector, [], config.first_iterations, config.first_rate_factor, on_iteration=on_iteration
+            images, frame, pose, [], config.first_iterations, config.first_rate_factor, on_iteration=on_iteration
         )
 
     def start_frame(
-        self, images: ImagePool, frame: int, vector: np.ndarray, keyframes: list[Keyframe]
+        self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe]
     ) -> Callable[[], MappingResult]:
         """`map_frame` without waiting for the device: the function that is returned waits, and reads the outcome."""
-        return self._optimize(images, frame, vector, keyframes, self.config.iterations, 1.0)
+        return self._optimize(images, frame, pose, keyframes, self.config.iterations, 1.0)
 
     def refine(
         self,
         images: ImagePool,
         frame: int,
-        vector: np.ndarray,
+        pose: np.ndarray,
         keyframes: list[Keyframe],
         rounds: range,
     ) -> MappingResult:
         """Final colour refinement: a doubled window, all vertices, colour stage only, colour decoder fixed, several
         rounds, whose numbers are part of the seeds.
         """
-        result = MappingResult(vector)
+        result = MappingResult(pose)
         for round_ in rounds:
             result = self._optimize(
-                images, frame, result.vector, keyframes, self.config.iterations, 1.0, refinement=True, round_=round_
+                images, frame, result.pose, keyframes, self.config.iterations, 1.0, refinement=True, round_=round_
             )()
         return result
 
@@ -146,7 +166,7 @@ class Mapper:
         self,
         images: ImagePool,
         frame: int,
-        vector: np.ndarray,
+        pose: np.ndarray,
         keyframes: list[Keyframe],
         iterations: int,
         rate_factor: float,
@@ -157,68 +177,78 @@ class Mapper:
     ) -> Callable[[], MappingResult]:
         """Launch a whole call; what is returned reads its outcome."""
         config = self.config
-        rng = np.random.default_rng([self.seed, 2, frame, round_])
-        size = config.window * (2 if refinement else 1)
-        window = self._choose_window(images, vector, keyframes, size, rng)
-        coarse = self._choose_coarse_window(keyframes, rng) if config.coarse and not refinement else []
-        adjust = (
-            config.bundle_adjustment
-            and config.bundle_adjustment_rate > 0
-            and len(keyframes) >= config.bundle_adjustment_keyframes
-        )
-        # The oldest keyframe holds the window in place: it comes first, and its pose stays.
-        window.sort(key=lambda keyframe: keyframe.index)
-        rates = np.full((1, 2), config.bundle_adjustment_rate)
-        self._poses.begin(np.stack([*(keyframe.pose for keyframe in window), vector]), rates)
+        call = _Call(frame, pose, rate_factor, self._adjusts(keyframes), refinement, round_)
+        coarse = self._choose_windows(call, images, keyframes)
+        self._poses.begin(_vectors(call.window, pose), np.full((1, 2), config.bundle_adjustment_rate))
         # Both windows at once: they must be on the device together.
-        in_use = images.bring([keyframe.image for keyframe in (*window, *coarse)])
-        slots = wp.array([*in_use[: len(window)], 0], dtype=int, device=self.device)
-        T_world_camera = pose_from_vector(vector)
-        self._select(images, T_world_camera, everything=refinement)
-        ray_counts: dict[str, int] = {}
+        in_use = images.bring([keyframe.image for keyframe in (*call.window, *coarse)])
+        slots = wp.array([*in_use[: len(call.window)], 0], dtype=int, device=self.device)
+        self._select(images, pose, everything=refinement)
         self._launcher.forget()
 
         if config.coarse and not refinement:
-            coarse_slots = wp.array([*in_use[len(window) :], 0], dtype=int, device=self.device)
-            poses = np.stack([*(keyframe.pose for keyframe in coarse), vector]).astype(np.float32)
-            coarse_poses = wp.array(poses, dtype=float, device=self.device)
+            coarse_slots = wp.array([*in_use[len(call.window) :], 0], dtype=int, device=self.device)
+            coarse_poses = wp.array(_vectors(coarse, pose).astype(np.float32), dtype=float, device=self.device)
             count = config.first_iterations if not keyframes and rate_factor != 1.0 else config.coarse_iterations
             self._run_coarse(images, frame, coarse_slots, coarse_poses, count, rate_factor)
-            self._note_loss("coarse", ray_counts)
+            self._note_loss("coarse", call)
+        self._run_stages(call, images, slots, self._schedule(iterations, refinement), on_iteration)
+        self._changed = {level for stage in call.ray_counts for level in _STAGE_LEVELS[stage]}
+        return partial(self._outcome, call)
 
-        stages = self._schedule(iterations, refinement)
+    def _adjusts(self, keyframes: list[Keyframe]) -> bool:
+        """Whether poses are refined."""
+        config = self.config
+        enough = len(keyframes) >= config.bundle_adjustment_keyframes
+        return config.bundle_adjustment and config.bundle_adjustment_rate > 0 and enough
+
+    def _choose_windows(self, call: _Call, images: ImagePool, keyframes: list[Keyframe]) -> list[Keyframe]:
+        """Sets the call's window; returns that of the coarse level."""
+        config = self.config
+        rng = np.random.default_rng([self.seed, 2, call.frame, call.round])
+        size = config.window * (2 if call.refinement else 1)
+        if config.selection == "overlap":
+            window = overlapping_window(keyframes, size, rng, images.current_depth(), call.pose, self.camera)
+        else:
+            window = random_window(keyframes, size, rng)
+        # The oldest keyframe holds the window in place: it comes first, and its pose stays.
+        call.window = sorted(window, key=lambda keyframe: keyframe.index)
+        if not config.coarse or call.refinement:
+            return []
+        # The last keyframe takes part in the coarse level however small the window.
+        return random_window(keyframes, max(config.window, 2), rng)
+
+    def _run_stages(
+        self, call: _Call, images: ImagePool, slots: wp.array, stages: list[str], on_iteration: Callable | None
+    ) -> None:
+        """All iterations of the middle, fine and colour stages, Eq. 8-10."""
+        frame, round_ = call.frame, call.round
         self._batch.set_seeds([ray_seed(self.seed, 3, frame, n, round_) for n in range(len(stages))])
         for iteration, stage in enumerate(stages):
             if self._errors is not None and (iteration == 0 or stage != stages[iteration - 1]):
                 seed = ray_seed(self.seed, 5, frame, iteration, round_)
                 self._errors.measure(self.scene.arrays(), images.arrays, slots, self._poses.poses, self.camera, seed)
-
-            def iterate(stage: str = stage) -> None:
-                self._iterate(images, slots, T_world_camera, stage, rate_factor, adjust, refinement)
-
-            self._launcher.iterate(stage, (), iterate)
-            last_of_stage = iteration + 1 == len(stages) or stages[iteration + 1] != stage
-            if last_of_stage:
-                self._note_loss(stage, ray_counts)
+            self._launcher.iterate(stage, (), partial(self._iterate, call, images, slots, stage))
+            if iteration + 1 == len(stages) or stages[iteration + 1] != stage:
+                self._note_loss(stage, call)
             if on_iteration is not None:
                 on_iteration(stage, iteration, len(stages))
-        self._changed = {level for stage in ray_counts for level in _STAGE_LEVELS[stage]}
 
-        def outcome() -> MappingResult:
-            for name, optimizer in (*self._grids.items(), ("colour decoder", self._decoder)):
-                if optimizer.has_rejected:
-                    _log.warning("frame %d: gradients of the %s were not finite and have been left out", frame, name)
-            result = MappingResult(vector, window=[keyframe.index for keyframe in window], adjusted=adjust)
-            losses = self._losses.numpy()
-            result.losses = {s: float(losses[STAGES.index(s)]) / max(count, 1) for s, count in ray_counts.items()}
-            if adjust:
-                vectors = self._poses.vectors()
-                for keyframe, refined in zip(window[1:], vectors[1:-1], strict=True):
-                    keyframe.pose = _normalized(refined)
-                result.vector = _normalized(vectors[-1])
-            return result
-
-        return outcome
+    def _outcome(self, call: _Call) -> MappingResult:
+        """Wait for a call, write the refined poses into its keyframes, and tell what came out."""
+        for name, optimizer in (*self._grids.items(), ("colour decoder", self._decoder)):
+            if optimizer.has_rejected:
+                _log.warning("frame %d: gradients of the %s were not finite and have been left out", call.frame, name)
+        result = MappingResult(call.pose, window=[keyframe.index for keyframe in call.window], adjusted=call.adjust)
+        losses = self._losses.numpy()
+        result.losses = {s: float(losses[STAGES.index(s)]) / max(count, 1) for s, count in call.ray_counts.items()}
+        if call.adjust:
+            # Adam moves the length of a quaternion freely, which changes nothing but the step sizes.
+            poses = [pose_from_vector(vector) for vector in self._poses.vectors()]
+            for keyframe, refined in zip(call.window[1:], poses[1:-1], strict=True):
+                keyframe.pose = refined
+            result.pose = poses[-1]
+        return result
 
     def _schedule(self, iterations: int, refinement: bool) -> list[str]:
         """Stage of each iteration; both comparisons are inclusive, as in the released code."""
@@ -229,29 +259,9 @@ class Mapper:
         first = "middle" if self.config.optimize_middle else "fine"
         return [first if j <= middle else "fine" if j <= fine else "color" for j in range(iterations)]
 
-    @phase("keyframe selection")
-    def _choose_window(
-        self, images: ImagePool, vector: np.ndarray, keyframes: list[Keyframe], size: int, rng: np.random.Generator
-    ) -> list[Keyframe]:
-        """Up to ``size`` - 2 keyframes that see what the current frame sees (or random ones), and the last keyframe."""
-        if not keyframes or size < 2:
-            return []
-        *candidates, last = keyframes
-        if self.config.selection == "overlap" and candidates:
-            fractions = overlap_fractions(
-                images.depth_image(0),
-                pose_from_vector(vector),
-                [pose_from_vector(keyframe.pose) for keyframe in candidates],
-                self.camera,
-                rng,
-            )
-            candidates = [keyframe for keyframe, fraction in zip(candidates, fractions, strict=True) if fraction > 0]
-        order = rng.permutation(len(candidates))[: max(size - 2, 0)]
-        return [*(candidates[n] for n in order), last]
-
     def _select(self, images: ImagePool, T_world_camera: np.ndarray, *, everything: bool) -> None:
         """Which vertices of each level may change during this call; and note those that the frame has measured."""
-        depth = wp.array(images.depth_image(0), dtype=float, device=self.device)
+        depth = images.metres()
         for level, optimizer in self._grids.items():
             grid = self.scene.grids[level]
             if level in self._frozen:
@@ -268,20 +278,9 @@ class Mapper:
         mark_seen(self.scene.grids["color"], self.camera, T_world_camera, depth)
         self._decoder.begin()
 
-    def _iterate(
-        self,
-        images: ImagePool,
-        slots: wp.array,
-        T_world_camera: np.ndarray,
-        stage: str,
-        rate_factor: float,
-        adjust: bool,
-        refinement: bool,
-    ) -> None:
-        """One iteration of a stage; nothing in it may depend on the iteration's number, because it is replayed.
-
-        T_world_camera: Of the current frame, before bundle adjustment (4, 4).
-        """
+    def _iterate(self, call: _Call, images: ImagePool, slots: wp.array, stage: str) -> None:
+        """One iteration of a stage; nothing in it may depend on the iteration's number, because it is replayed."""
+        adjust, refinement, rate_factor, T_world_camera = call.adjust, call.refinement, call.rate_factor, call.pose
         config, batch, arrays = self.config, self._batch, self.scene.arrays()
         color = stage == "color"
         train_decoder = color and config.train_color_decoder and not refinement
@@ -324,13 +323,6 @@ class Mapper:
 
     # -- the coarse level (Sec. 3.1; in the released code it serves forecasts only) -------------------------------
 
-    def _choose_coarse_window(self, keyframes: list[Keyframe], rng: np.random.Generator) -> list[Keyframe]:
-        """Random keyframes from all but the last, and the last one."""
-        if not keyframes:
-            return []
-        *others, last = keyframes
-        return [*(others[n] for n in rng.permutation(len(others))[: max(self.config.window - 2, 0)]), last]
-
     def _run_coarse(
         self,
         images: ImagePool,
@@ -361,12 +353,12 @@ class Mapper:
         for _ in range(iterations):
             self._launcher.iterate("coarse", (), iterate)
 
-    def _note_loss(self, stage: str, ray_counts: dict[str, int]) -> None:
+    def _note_loss(self, stage: str, call: _Call) -> None:
         """Keep the loss of the last iteration on the device until the end of the call."""
-        ray_counts[stage] = self._batch.count
+        call.ray_counts[stage] = self._batch.count
         wp.copy(self._losses, self._batch.loss, dest_offset=STAGES.index(stage), count=1)
 
 
-def _normalized(vector: np.ndarray) -> np.ndarray:
-    """Pose vector with a unit quaternion: Adam moves its length freely, which changes nothing but the step sizes."""
-    return vector_from_pose(pose_from_vector(vector))
+def _vectors(keyframes: list[Keyframe], pose: np.ndarray) -> np.ndarray:
+    """Pose vectors of keyframes and, last, of the current frame, float64 (frames, 7)."""
+    return np.stack([vector_from_pose(T) for T in (*(keyframe.pose for keyframe in keyframes), pose)])

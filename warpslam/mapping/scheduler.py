@@ -40,30 +40,29 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class MappingTask:
-    """A frame to map, whose image is in slot 0 of the pool.
-
-    kind: "first" frame of a map, a later "frame", or final "refinement" of the map.
-    frame: Its number. vector: Its pose vector (7,).
-    extent: Box to grow the map to, lower and upper corner [m]; None leaves the map's.
-    rounds: Numbers of the rounds of a refinement.
-    """
+    """A frame to map, whose image is in slot 0 of the pool."""
 
     kind: Literal["first", "frame", "refinement"]
+    """The first frame of a map, a later one, or the final refinement of the map."""
     frame: int
-    vector: np.ndarray
+    """Its number."""
+    pose: np.ndarray
+    """Its T_world_camera (4, 4)."""
     extent: tuple[np.ndarray, np.ndarray] | None = None
+    """Box to grow the map to, lower and upper corner [m]; None leaves the map's."""
     rounds: range = range(0)
+    """Numbers of the rounds of a refinement."""
 
     def start(self, mapper: Mapper, images: ImagePool, keyframes: list[Keyframe]) -> Callable[[], MappingResult]:
         """Launch the work; the function that is returned waits for it and reads its outcome."""
         if self.extent is not None:
             mapper.scene.cover(*self.extent)
         if self.kind == "first":
-            return mapper.start_first(images, self.frame, self.vector)
+            return mapper.start_first(images, self.frame, self.pose)
         if self.kind == "frame":
-            return mapper.start_frame(images, self.frame, self.vector, keyframes)
+            return mapper.start_frame(images, self.frame, self.pose, keyframes)
         # Its rounds build on one another: it is done when they are.
-        result = mapper.refine(images, self.frame, self.vector, keyframes, self.rounds)
+        result = mapper.refine(images, self.frame, self.pose, keyframes, self.rounds)
         return lambda: result
 
 
@@ -202,7 +201,7 @@ class _UnderWay:
             # The frame itself may have become a keyframe meanwhile.
             for keyframe in self.keyframes[len(self.copies) :]:
                 if keyframe.index == self.task.frame:
-                    keyframe.pose = result.vector.copy()
+                    keyframe.pose = result.pose.copy()
 
 
 class _Thread:

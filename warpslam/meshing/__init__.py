@@ -2,7 +2,7 @@
 
 from warpslam.meshing.extraction import FREE_LOGIT, UNOBSERVED_LOGIT, Field, extract_mesh
 from warpslam.meshing.files import check_mesh_path, write_mesh
-from warpslam.meshing.views import ObservedView
+from warpslam.scene.mapped_views import ObservedView
 
 __all__ = [
     "FREE_LOGIT",

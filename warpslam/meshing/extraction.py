@@ -25,8 +25,9 @@ import trimesh
 from warpslam.errors import InputError, MeshError
 from warpslam.meshing.cleaning import Hull, face_vectors, keep_faces, piece_areas, vertex_normals
 from warpslam.meshing.marching_cubes import Surface, all_corners, touched_points
-from warpslam.meshing.views import Evidence, ObservedView
+from warpslam.meshing.views import Evidence
 from warpslam.runtime.phases import phase
+from warpslam.scene.mapped_views import ObservedView
 
 UNOBSERVED_LOGIT = -100.0
 # What an observed point farther than the band from every surface holds: free, without asking the field.
@@ -80,26 +81,33 @@ def extract_mesh(
 ) -> trimesh.Trimesh:
     """Mesh of the observed part of the occupancy field, with colours and vertex normals (supplement A.4).
 
-    scene: Field to mesh, see `Field`.
-    views: Depth images that say what was seen, usually the keyframes; a fraction of the resolution is enough.
-    voxel: Lattice spacing [m].
-    level_set: Logit of the surface; above is occupied.
-    min_component_area: Connected pieces with less area [m^2] are dropped, unless views measured a surface within 4 cm
-        of half of it: what is seen through a lattice comes in small pieces, but so do floating artefacts.
-    behind_surface: Points up to this far behind a measured surface [m] count as observed; at least two voxels are used.
-    band: The field is asked only at points this close to a measured surface [m] (at least two voxels); other observed
-        points are taken as free. None asks it at every observed point, which also shows floating artefacts.
-    cull_back_faces: Drop faces that no observing view sees from the front: a map is untrained a few centimetres behind
-        a surface and may turn free again there, which would make a second, inner shell.
-    forecast: Add the surface that the coarse level suggests where nothing was seen, in cyan, as far as views reach and
-        inside the convex hull of what they saw. The seen part of the mesh is the same as without.
-    block_cells: Cells a block has along each axis. Trades memory for overhead; the mesh does not depend on it.
-    device: Warp device of the seen test; None is Warp's default.
-    progress: Called with (blocks done, blocks).
+    Args:
+        scene: Field to mesh.
+        views: Depth images that say what was seen, usually the keyframes; a fraction of the resolution is enough.
+        voxel: Lattice spacing [m].
+        level_set: Logit of the surface; above is occupied.
+        min_component_area: Connected pieces with less area [m^2] are dropped, unless views measured a surface within
+            4 cm of half of it: what is seen through a lattice comes in small pieces, but so do floating artefacts.
+        behind_surface: Points up to this far behind a measured surface [m] count as observed; at least two voxels are
+            used.
+        band: The field is asked only at points this close to a measured surface [m] (at least two voxels); other
+            observed points are taken as free. None asks it at every observed point, which also shows floating
+            artefacts.
+        cull_back_faces: Drop faces that no observing view sees from the front: a map is untrained a few centimetres
+            behind a surface and may turn free again there, which would make a second, inner shell.
+        forecast: Add the surface that the coarse level suggests where nothing was seen, in cyan, as far as views reach
+            and inside the convex hull of what they saw. The seen part of the mesh is the same as without.
+        block_cells: Cells a block has along each axis. Trades memory for overhead; the mesh does not depend on it.
+        device: Warp device of the seen test; None is Warp's default.
+        progress: Called with (blocks done, blocks).
 
-    Returns a mesh in world metres whose normals point to free space; vertex colours are uint8 RGBA, and
-    `metadata["forecast_faces"]` counts the faces of the forecast, which come last.
-    Raises `MeshError` where there is nothing to mesh or the field is not finite, `InputError` for a bad argument.
+    Returns:
+        A mesh in world metres whose normals point to free space; vertex colours are uint8 RGBA, and
+        ``metadata["forecast_faces"]`` counts the faces of the forecast, which come last.
+
+    Raises:
+        MeshError: There is nothing to mesh, or the field is not finite.
+        InputError: A bad argument.
     """
     _check_arguments(voxel, level_set, min_component_area, behind_surface, band, block_cells)
     behind = max(behind_surface, 2.0 * voxel)
@@ -139,23 +147,28 @@ def extract_mesh(
 
 @dataclass(frozen=True)
 class _Block:
-    """Part of the lattice: first index (3,), points along each axis, views that may have observed some of it, and views
-    that it may be in reach of (None without a forecast).
-    """
+    """Part of the lattice."""
 
     start: np.ndarray
+    """First index (3,)."""
     shape: tuple[int, int, int]
+    """Points along each axis."""
     visible: np.ndarray
+    """Views that may have observed some of it."""
     in_reach: np.ndarray | None
+    """Views that it may be in reach of; None without a forecast."""
 
 
 @dataclass
 class _Found:
-    """What the errors report: points observed, and the range of the logits asked for."""
+    """What the errors report."""
 
     observed_count: int = 0
+    """Points that were observed."""
     least: float = np.inf
+    """Smallest logit of those asked for."""
     most: float = -np.inf
+    """Largest of them."""
 
 
 def _mesh_block(

@@ -14,7 +14,11 @@ MESH_SUFFIXES = (".ply", ".glb")
 
 
 def check_mesh_path(path: str | os.PathLike[str]) -> Path:
-    """Return the path, or raise `MeshError` where its suffix is none that `write_mesh` knows."""
+    """The path of a mesh file.
+
+    Raises:
+        MeshError: `write_mesh` does not know its suffix.
+    """
     path = Path(path)
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise MeshError(f"{path}: a mesh is written as {' or '.join(MESH_SUFFIXES)}, by the suffix of its file")
@@ -26,7 +30,8 @@ def write_mesh(mesh: trimesh.Trimesh, path: str | os.PathLike[str]) -> Path:
 
     Both hold world coordinates [m] as they are. An existing file is replaced only once all is written.
 
-    Raises `MeshError` where the mesh is empty, the suffix is another one, or the file can't be written.
+    Raises:
+        MeshError: The mesh is empty, the suffix is another one, or the file can't be written.
     """
     path = check_mesh_path(path)
     if len(mesh.faces) == 0:

@@ -14,7 +14,6 @@ on every side.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.errors import InputError, MeshError
-from warpslam.poses import check_transform
+from warpslam.scene.mapped_views import ObservedView
 
 # The reference enlarges images by 1000 px; in focal lengths of its Replica camera (600 px), as images have many sizes.
 REACH_MARGIN = 1000.0 / 600.0
@@ -36,42 +35,6 @@ _DEPTH_EDGE = wp.constant(0.1)
 _MAX_BEHIND_ALONG_Z = 3.0
 _MAX_FRONT_ALONG_Z = 5.0
 _CLOUD_SIZE = 200_000
-
-
-@dataclass(frozen=True)
-class ObservedView:
-    """A depth image and where it was taken: the evidence for what has been seen.
-
-    depth: z-depth [m], float32, shape (H, W). Zero, negative and non-finite pixels count as missing.
-    intrinsics: Camera of exactly this image (`Intrinsics.scaled` for a downsampled one).
-    T_world_camera: Camera-to-world transform, shape (4, 4), OpenCV axes.
-
-    Raises `InputError` where the depth is no image of the camera's size or the transform is not rigid.
-    """
-
-    depth: np.ndarray
-    intrinsics: Intrinsics
-    T_world_camera: np.ndarray
-
-    def __post_init__(self) -> None:
-        depth = np.asarray(self.depth, dtype=np.float32)
-        size = (self.intrinsics.height, self.intrinsics.width)
-        if depth.shape != size or min(size) < 2:
-            raise InputError(
-                f"ObservedView.depth has shape {depth.shape}, the camera's image {size}, and 2 x 2 is the least; "
-                "for a resized image pass intrinsics.scaled(width, height)"
-            )
-        valid = np.isfinite(depth) & (depth > 0)
-        object.__setattr__(self, "depth", np.where(valid, depth, np.float32(0.0)))
-        object.__setattr__(self, "T_world_camera", check_transform(self.T_world_camera, "ObservedView.T_world_camera"))
-
-    def points(self) -> np.ndarray:
-        """World points [m] of the pixels with depth, float64, shape (N, 3)."""
-        v, u = np.nonzero(self.depth)
-        z = self.depth[v, u].astype(np.float64)
-        camera = self.intrinsics
-        local = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
-        return local @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
 
 
 _OBSERVED = wp.constant(1)

@@ -19,11 +19,12 @@ from warpslam.errors import CheckpointError, ConfigError, DatasetError
 from warpslam.runs.folder import RunFolder
 from warpslam.runs.record import RunProgress, result_row
 from warpslam.runs.request import RunRequest, Source
+from warpslam.slam import Slam
+from warpslam.slam_state import state_arrays, state_from_arrays
 from warpslam.storage.state_file import StateFormat, read_state, sync_folder, write_state
 
 if TYPE_CHECKING:
     from warpslam.sequences.base import Frame, RgbdSequence
-    from warpslam.slam import Slam
 
 RUN_FORMAT = StateFormat("warpslam-run", 3)
 log = logging.getLogger(__name__)
@@ -57,9 +58,9 @@ class SavedRun:
             CheckpointError: a field is damaged.
         """
         from warpslam.runtime.cores import slice_count
-        from warpslam.slam_state import slam_from_state
 
-        slam = slam_from_state(self.path, *self.state, device=self.request.device, config=config)
+        state = state_from_arrays(self.path, *self.state, config=config)
+        slam = Slam.from_state(state, self.request.device)
         slam.config.mapping.enabled &= not self.request.localize_only
         if slam.config.schedule == "overlapped":
             log.warning(
@@ -102,9 +103,7 @@ def write_checkpoint(
     Raises:
         CheckpointError: the file can't be written.
     """
-    from warpslam.slam_state import slam_state
-
-    header, arrays = slam_state(slam)
+    header, arrays = state_arrays(slam.state())
     run = {
         "request": dataclasses.asdict(request),
         "checkpoint_every": checkpoint_every,

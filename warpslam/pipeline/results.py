@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import logging
 import os
 import platform
@@ -106,10 +105,7 @@ class RunResults:
     def _trajectory(self) -> tuple[Trajectory, int]:
         """The trajectory, and how many of its poses belong to frames that were finished."""
         assert self.slam is not None
-        trajectory, first = self.slam.trajectory, self.first_index
-        if first:
-            parts = (trajectory.timestamps[first:], trajectory.poses[first:], trajectory.status[first:])
-            trajectory = dataclasses.replace(trajectory, timestamps=parts[0], poses=parts[1], status=parts[2])
+        trajectory = self.slam.trajectory.after(self.first_index)
         # After an interrupt the trajectory may hold the pose of a frame that never came back.
         return trajectory, len(self.results)
 

@@ -6,8 +6,9 @@
     print(p.table())
     p.write_trace("trace.json")
 
-`phases` marks the parts of the algorithm, `recorder` times launches while a profile is active, `costs` knows what a
-kernel computes and moves, `report` puts it together. While no profile is active nothing of this is in a launch's way.
+`recorder` times launches while a profile is active and keeps `records` of them, `costs` knows what a kernel computes
+and moves, `report` and `trace` show it, and `session` has the `Profile` that a user holds. `warpslam.runtime.phases`
+marks the parts of the algorithm. While no profile is active nothing of this is in a launch's way.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ from typing import TYPE_CHECKING
 from warpslam.runtime.phases import phase as phase
 
 if TYPE_CHECKING:
-    from warpslam.profiling.recorder import Profile
+    from warpslam.profiling.session import Profile
 
 
 def profile() -> Profile:
-    """A profile of what runs inside the ``with`` block, on all threads; see `warpslam.profiling.recorder.Profile`."""
-    from warpslam.profiling.recorder import Profile
+    """A profile of what runs inside the ``with`` block, on all threads; see `warpslam.profiling.session.Profile`."""
+    from warpslam.profiling.session import Profile  # with Warp, which `warpslam.profile` alone does not need
 
     return Profile()

@@ -23,24 +23,24 @@ import warp as wp
 
 from warpslam.field.complexity import decoder_shapes, flops_per_point
 from warpslam.field.decoders import EMBEDDING_SIZE, FEATURE_SIZE, MAX_HIDDEN
+from warpslam.kernels.compositing import COUNT_STRIDE
+from warpslam.kernels.decoder import OUT_64
 
 ROW_BYTES = 4 * FEATURE_SIZE
 
 
 @dataclass(frozen=True)
 class Work:
-    """What one launch does.
-
-    points: Samples (or queried points) it computes; None for kernels that do not work on samples.
-    flop: Floating-point operations, for the decoders only.
-    bytes: Read and written, for kernels that do little else; 0 for the others.
-    counted: Whether skipped points are left out of ``points``; else it is an upper bound.
-    """
+    """What one launch does."""
 
     points: int | None = None
+    """Samples (or queried points) it computes; None for kernels that do not work on samples."""
     flop: float = 0.0
+    """Floating-point operations, for the decoders only."""
     bytes: float = 0.0
+    """Read and written, for kernels that do little else; 0 for the others."""
     counted: bool = True
+    """Whether skipped points are left out of ``points``; else it is an upper bound."""
 
 
 NOTHING = Work()
@@ -171,8 +171,6 @@ def _backward(level: str | None = None) -> Model:
 
 def _listed(each: int, threads: int, arguments: Arguments) -> Work:
     """Work on the samples of a list; where its length can't be read, one a thread."""
-    from warpslam.kernels.compositing import COUNT_STRIDE
-
     try:
         points = arguments.integer("listed_count", COUNT_STRIDE * arguments.number("slot"))
     except KeyError:
@@ -188,8 +186,6 @@ def _optional(arguments: Arguments, name: str) -> Any:
 
 
 def _level_of(arguments: Arguments) -> str:
-    from warpslam.kernels.decoder import OUT_64
-
     return "fine" if arguments.number("output_row") == OUT_64 else "middle"
 
 

@@ -16,11 +16,10 @@ import contextvars
 import math
 import threading
 from collections import defaultdict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -28,91 +27,54 @@ import warp._src.context as warp_context
 
 from warpslam.errors import WarpSlamError
 from warpslam.profiling.costs import NOTHING, Arguments, Work, work_of
-from warpslam.profiling.records import GPU, Interval, Launch
-from warpslam.runtime import launching, phases
+from warpslam.profiling.records import GPU, Interval, Launch, Recording
+from warpslam.runtime import launching, phases, program
 from warpslam.runtime.phases import Span, clock
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from warpslam.profiling.report import Report
 
 _PEAK_SIZE = 2048
 
 
-class Profile:
-    """What ran inside its ``with`` block; once the block is left, `table`, `to_json` and `write_trace` report it.
+class Recorder:
+    """Fills a `Recording` with what all threads do from `begin` to `end`; one can be active at a time."""
 
-    Only one profile can be active at a time, and it sees all threads. Phases that other threads enter run beside those
-    of the one that profiles, so that walls may then add up to more than ``wall_seconds``.
-
-    launches, intervals, spans: What was recorded.
-    peak_gflops: Single-precision matrix product of NumPy on all cores, measured as the block is entered [GFLOP/s].
-    wall_seconds: Length of the block [s].
-    """
-
-    def __init__(self) -> None:
-        self.launches: list[Launch] = []
-        self.intervals: list[Interval] = []
-        self.spans: list[Span] = []
-        self.threads: dict[int, str] = {}
-        self.peak_gflops = 0.0
-        self.wall_seconds = 0.0
-        self.start = 0.0
+    def __init__(self, recording: Recording) -> None:
+        self.recording = recording
         self._inside = threading.local()
         self._patches = ExitStack()
         self._cuda: _CudaTimer | None = None
-        self._report: Report | None = None
 
-    def __enter__(self) -> Profile:
+    @property
+    def is_active(self) -> bool:
+        """Whether it records at present."""
+        return phases.listener is self
+
+    def begin(self) -> None:
+        """Replace the functions that launch.
+
+        Raises:
+            WarpSlamError: Another recorder is active, or this version of Warp launches in another way.
+        """
         if phases.listener is not None:
             raise WarpSlamError("a profile is active already: leave its with block before another one begins")
-        self.peak_gflops = matrix_peak_gflops()
+        self.recording.peak_gflops = matrix_peak_gflops()
         wp.init()
         if wp.is_cuda_available():
             self._cuda = _CudaTimer(self)
         self._patch()
         phases.listener = self
         self._root = phases.enter(phases.OTHER)
-        self.start = self._root.start
-        return self
+        self.recording.start = self._root.start
 
-    def __exit__(self, *_: object) -> None:
+    def end(self) -> None:
+        """Put them back."""
         self.changes()
         phases.leave(self._root)
         self.left(self._root)
-        self.wall_seconds = self._root.stop - self.start
+        self.recording.wall_seconds = self._root.stop - self._root.start
         phases.listener = None
         self._patches.close()
         if self._cuda is not None:
             self._cuda.end()
-
-    # -- what came out -------------------------------------------------------------------------------------------
-
-    @property
-    def report(self) -> Report:
-        """The figures; see `warpslam.profiling.report.Report`."""
-        from warpslam.profiling.report import Report
-
-        if phases.listener is self:
-            raise WarpSlamError("the profile is still active: leave its with block first")
-        if self._report is None:
-            self._report = Report(self)
-        return self._report
-
-    def table(self, width: int = 160) -> str:
-        """Tables of phases, kernels and compiled modules, as text."""
-        return self.report.table(width)
-
-    def to_json(self) -> str:
-        """The same figures, unrounded, as JSON."""
-        return self.report.to_json()
-
-    def write_trace(self, path: str | Path) -> None:
-        """Write every launch with its time and thread in the trace event format, for Perfetto or chrome://tracing."""
-        from warpslam.profiling.trace import write_trace
-
-        write_trace(self, Path(path))
 
     # -- phases --------------------------------------------------------------------------------------------------
 
@@ -124,13 +86,13 @@ class Profile:
     def left(self, span: Span) -> None:
         """A stay in a phase is over."""
         self._where()
-        self.spans.append(span)
+        self.recording.spans.append(span)
 
     def _where(self) -> tuple[str, int, bool]:
         """Phase, thread, and whether the phase was entered by it."""
         thread, span = threading.get_ident(), phases.current()
-        if thread not in self.threads:
-            self.threads[thread] = threading.current_thread().name
+        if thread not in self.recording.threads:
+            self.recording.threads[thread] = threading.current_thread().name
         return (phases.OTHER, thread, False) if span is None else (span.path, thread, span.thread == thread)
 
     # -- hooks ---------------------------------------------------------------------------------------------------
@@ -146,14 +108,14 @@ class Profile:
             (wp, "launch", self._timed_launch(wp.launch)),
             (wp.Launch, "launch", self._timed_command(wp.Launch.launch)),
             (wp.Module, "load", self._timed_load(wp.Module.load)),
-            (launching, "_pool", self._timed_pool(launching._pool)),
+            (program, "_pool", self._timed_pool(program._pool)),
             (launching.Launcher, "iterate", _iterate_in_phase(launching.Launcher.iterate)),
-            (launching.Program, "run", _run_without_graph(launching.Program.run)),
+            (program.Program, "run", _run_without_graph(program.Program.run)),
         ):
             self._patches.enter_context(_replaced(owner, name, replacement))
 
     def _add(self, what: str, start: float, seconds: float, name: str = "") -> None:
-        self.intervals.append(Interval(what, *self._where(), start, seconds, name))
+        self.recording.intervals.append(Interval(what, *self._where(), start, seconds, name))
 
     def _accounted(self) -> float:
         """Seconds of this thread that launches and loads have already been charged with."""
@@ -172,7 +134,8 @@ class Profile:
             original(kernel, timed, params, adjoint)
             left = clock()
             path, thread, own = self._where()
-            self.launches.append(Launch(_name(kernel, adjoint), path, thread, own, timed.start, timed.stop, work))
+            launch = Launch(_name(kernel, adjoint), path, thread, own, timed.start, timed.stop, work)
+            self.recording.launches.append(launch)
             self._add("profiler", entered, begun - entered)
             self._add("launch", begun, left - begun - (timed.stop - timed.start))
             self._account(left - entered)
@@ -248,33 +211,33 @@ class _TimedHooks:
 class _TimedPool:
     """Hands work to the pool in the phase it comes from, and notes how long its result is waited for."""
 
-    def __init__(self, pool: ThreadPoolExecutor, profile: Profile) -> None:
-        self._pool, self._profile = pool, profile
+    def __init__(self, pool: ThreadPoolExecutor, recorder: Recorder) -> None:
+        self._pool, self._recorder = pool, recorder
 
     def submit(self, function: Callable, *args: Any) -> _TimedFuture:
         context = contextvars.copy_context()
-        return _TimedFuture(self._pool.submit(context.run, function, *args), self._profile)
+        return _TimedFuture(self._pool.submit(context.run, function, *args), self._recorder)
 
 
 class _TimedFuture:
-    def __init__(self, future: Future, profile: Profile) -> None:
-        self._future, self._profile = future, profile
+    def __init__(self, future: Future, recorder: Recorder) -> None:
+        self._future, self._recorder = future, recorder
 
     def result(self) -> Any:
         start = clock()
         try:
             return self._future.result()
         finally:
-            self._profile._add("wait", start, clock() - start)
+            self._recorder._add("wait", start, clock() - start)
 
 
 class _CudaTimer:
     """Kernel times by the driver's events, read at changes of phase."""
 
-    def __init__(self, profile: Profile) -> None:
-        self._profile = profile
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
         self._pending: dict[str, deque[Work]] = defaultdict(deque)
-        profile.threads[GPU] = "GPU"
+        recorder.recording.threads[GPU] = "GPU"
         self._begin()
 
     def _begin(self) -> None:
@@ -296,7 +259,7 @@ class _CudaTimer:
         wp.timing_end()
 
     def _read(self) -> None:
-        path = self._profile._where()[0]
+        path = self._recorder._where()[0]
         start = self._since
         for result in wp.timing_end():
             # "forward kernel middle_forward_f40074b3", "backward kernel ...", "builtin kernel ...".
@@ -306,7 +269,7 @@ class _CudaTimer:
             waiting = self._pending.get(name)
             name, work = (name, waiting.popleft()) if waiting else (mangled, NOTHING)
             stop = start + 1e-3 * result.elapsed
-            self._profile.launches.append(Launch(name, path, GPU, False, start, stop, work))
+            self._recorder.recording.launches.append(Launch(name, path, GPU, False, start, stop, work))
             start = stop
         self._pending.clear()
 
@@ -326,11 +289,11 @@ def _iterate_in_phase(original: Callable) -> Callable:
 def _run_without_graph(original: Callable) -> Callable:
     """Launch by launch on CUDA: Warp times no kernel of a graph."""
 
-    def run(program: Any) -> None:
-        if not program.device.is_cuda:
-            original(program)
+    def run(recorded: program.Program) -> None:
+        if not recorded.device.is_cuda:
+            original(recorded)
             return
-        for step in program._steps:
+        for step in recorded._steps:
             command = getattr(step, "__self__", None)
             # A method bound before the profile began would be the one that is not timed.
             (command.launch if isinstance(command, wp.Launch) else step)()

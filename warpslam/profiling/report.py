@@ -6,80 +6,89 @@ import io
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 
+from warpslam.profiling.records import Launch, Recording
 from warpslam.storage.json_files import to_json
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from warpslam.profiling.recorder import Profile
-    from warpslam.profiling.records import Launch
 
 
 @dataclass
 class PhaseFigures:
-    """Seconds of a phase, without those of phases within it; all but the last on the thread that entered it.
-
-    wall: All of it; the sum of the next six.
-    kernels: In kernels.
-    launch: Preparing launches.
-    wait: For the slices on other threads.
-    load: Loading modules, compiling them included.
-    profiler: Counting points, which an unprofiled run does not.
-    python: The rest: Python, NumPy, and on CUDA waiting for the device.
-    elsewhere: In kernels on other threads, or on the GPU.
-    """
+    """Seconds of a phase without those of phases within it; all but ``elsewhere`` on the thread that entered it."""
 
     phase: str
+    """Names of the phase and of those around it."""
     calls: int = 0
+    """How often it was entered."""
     wall: float = 0.0
+    """All of it; the sum of the next six."""
     kernels: float = 0.0
+    """In kernels."""
     launch: float = 0.0
+    """Preparing launches."""
     wait: float = 0.0
+    """For the slices on other threads."""
     load: float = 0.0
+    """Loading modules, compiling them included."""
     profiler: float = 0.0
+    """Counting points, which an unprofiled run does not."""
     python: float = 0.0
+    """The rest: Python, NumPy, and on CUDA waiting for the device."""
     elsewhere: float = 0.0
+    """In kernels on other threads, or on the GPU."""
 
 
 @dataclass
 class KernelFigures:
-    """A kernel in a phase.
-
-    seconds: Summed over all threads. wall: During which at least one thread was in it.
-    share: Of the seconds of all kernels.
-    points: Samples computed; None for kernels that do not work on samples. counted: False if that is an upper bound.
-    gflops, peak_share, gigabytes_per_second: Rates over ``wall``; None where the kernel has no such work.
-    """
+    """A kernel in a phase; rates are over ``wall``, and None where the kernel has no such work."""
 
     kernel: str
+    """Name."""
     phase: str
+    """Path of the phase."""
     calls: int
+    """Launches."""
     seconds: float
+    """Summed over all threads."""
     wall: float
+    """Seconds during which at least one thread was in it."""
     mean_ms: float
+    """Mean of a launch [ms]."""
     p95_ms: float
+    """What 95 % of the launches stay below [ms]."""
     share: float
+    """Of the seconds of all kernels."""
     points: int | None = None
+    """Samples computed; None for kernels that do not work on samples."""
     counted: bool = True
+    """False if ``points`` is an upper bound."""
     points_per_second: float | None = None
+    """Samples a second."""
     gflop: float | None = None
+    """Operations of all launches [10^9]."""
     gflops: float | None = None
+    """Operations a second [10^9/s]."""
     peak_share: float | None = None
+    """``gflops`` over the rate of a matrix product on all cores."""
     gigabytes: float | None = None
+    """Read and written [GB]."""
     gigabytes_per_second: float | None = None
+    """Read and written a second [GB/s]."""
 
 
 @dataclass
 class ModuleFigures:
-    """Seconds that loading a module took, compiling it included."""
+    """A module that was loaded."""
 
     module: str
+    """Name."""
     phase: str
+    """Path of the phase."""
     seconds: float
+    """Loading it, compiling it included."""
 
 
 class Report:
@@ -89,14 +98,14 @@ class Report:
     overhead_us: Mean time a launch takes beyond its kernel [microseconds].
     """
 
-    def __init__(self, profile: Profile) -> None:
-        self.wall_seconds, self.peak_gflops = profile.wall_seconds, profile.peak_gflops
-        self.launch_count = len(profile.launches)
-        self.phases = _phases(profile)
-        self.kernels = _kernels(profile)
-        self.modules = [ModuleFigures(i.name, i.path, i.seconds) for i in profile.intervals if i.what == "load"]
+    def __init__(self, recording: Recording) -> None:
+        self.wall_seconds, self.peak_gflops = recording.wall_seconds, recording.peak_gflops
+        self.launch_count = len(recording.launches)
+        self.phases = _phases(recording)
+        self.kernels = _kernels(recording)
+        self.modules = [ModuleFigures(i.name, i.path, i.seconds) for i in recording.intervals if i.what == "load"]
         self.modules.sort(key=lambda m: -m.seconds)
-        launch_seconds = sum(i.seconds for i in profile.intervals if i.what == "launch")
+        launch_seconds = sum(i.seconds for i in recording.intervals if i.what == "launch")
         self.overhead_us = 1e6 * launch_seconds / max(self.launch_count, 1)
 
     def to_json(self) -> str:
@@ -123,8 +132,6 @@ class Report:
 
     def table(self, width: int) -> str:
         """The tables as text, ``width`` characters wide."""
-        from rich.console import Console
-
         console = Console(file=io.StringIO(), width=width)
         for table in self.tables():
             console.print(table)
@@ -172,20 +179,20 @@ class Report:
         return table
 
 
-def _phases(profile: Profile) -> list[PhaseFigures]:
+def _phases(recording: Recording) -> list[PhaseFigures]:
     figures: dict[str, PhaseFigures] = {}
-    for span in profile.spans:
+    for span in recording.spans:
         row = figures.setdefault(span.path, PhaseFigures(span.path))
         row.calls += 1
         row.wall += span.stop - span.start - span.inner
-    for launch in profile.launches:
+    for launch in recording.launches:
         row = figures.setdefault(launch.path, PhaseFigures(launch.path))
         seconds = launch.stop - launch.start
         if launch.own:
             row.kernels += seconds
         else:
             row.elsewhere += seconds
-    for interval in profile.intervals:
+    for interval in recording.intervals:
         if interval.own:
             row = figures.setdefault(interval.path, PhaseFigures(interval.path))
             setattr(row, interval.what, getattr(row, interval.what) + interval.seconds)
@@ -194,12 +201,12 @@ def _phases(profile: Profile) -> list[PhaseFigures]:
     return sorted(figures.values(), key=lambda row: -row.wall)
 
 
-def _kernels(profile: Profile) -> list[KernelFigures]:
+def _kernels(recording: Recording) -> list[KernelFigures]:
     groups: dict[tuple[str, str], list[Launch]] = defaultdict(list)
-    for launch in profile.launches:
+    for launch in recording.launches:
         groups[launch.kernel, launch.path].append(launch)
-    total = sum(launch.stop - launch.start for launch in profile.launches)
-    rows = [_kernel(name, path, launches, total, profile.peak_gflops) for (name, path), launches in groups.items()]
+    total = sum(launch.stop - launch.start for launch in recording.launches)
+    rows = [_kernel(name, path, launches, total, recording.peak_gflops) for (name, path), launches in groups.items()]
     return sorted(rows, key=lambda row: -row.seconds)
 
 
@@ -244,8 +251,6 @@ def _covered(intervals: Iterable[tuple[float, float]]) -> float:
 
 
 def _table(title: str, names: list[str], figures: list[str]) -> Table:
-    from rich.table import Table
-
     table = Table(title=title, title_justify="left")
     for name in names:
         table.add_column(name, overflow="fold")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from warpslam.storage.json_files import read_json, write_json
+from dataclasses import asdict
+from datetime import datetime
+from pathlib import Path
+
 from warpslam.errors import ConfigError, DatasetError
 from warpslam.runs.request import Source
-from dataclasses import asdict
-from pathlib import Path
-from datetime import datetime
+from warpslam.storage.json_files import read_json, write_json
 
 # Removed before a run writes into a folder that an earlier run used: a stale mesh beside a new trajectory misleads.
 _WRITTEN_FILES = (

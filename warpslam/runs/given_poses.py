@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
-from pathlib import Path
 from dataclasses import dataclass
-from warpslam.storage.tum import associate, read_tum
+from pathlib import Path
 
+import numpy as np
+
+from warpslam.storage.tum import associate, read_tum
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from warpslam.errors import DatasetError
 
+import numpy as np
+
+from warpslam.errors import DatasetError
 
 
 @dataclass(frozen=True)

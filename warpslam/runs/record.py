@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import numpy as np
 from dataclasses import dataclass, field
-from warpslam.evaluation import AteResult, ReconstructionResult, ate
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warpslam.evaluation import AteResult, ReconstructionResult
 from warpslam.runs.folder import RunFolder
-from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from warpslam.frames import FrameResult
-
 
 
 @dataclass(frozen=True)
@@ -66,4 +67,5 @@ class RunProgress:
 
 
 def result_row(result: FrameResult) -> dict[str, Any]:
+    """A result without its pose, as JSON takes it."""
     return {f.name: getattr(result, f.name) for f in dataclasses.fields(result) if f.name != "T_world_camera"}

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from warpslam.errors import ConfigError
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
-from collections.abc import Iterator
 
+from warpslam.errors import ConfigError
 
 
 def parse_slice(text: str) -> tuple[int | None, int | None, int | None]:
@@ -23,6 +23,7 @@ def parse_slice(text: str) -> tuple[int | None, int | None, int | None]:
     if not 2 <= len(parts) <= 3:
         raise ConfigError(f"frames = {text!r} is not A:B or A:B:STEP, for example 0:200 or ::2")
     return parts[0], parts[1], parts[2] if len(parts) == 3 else None
+
 
 # Room for more changes no result, and a run that ran out of it is one to resume.
 _FREE_TO_CHANGE = ("config.grid.max_gigabytes", "config.keyframes.max_gigabytes")

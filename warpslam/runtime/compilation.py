@@ -19,7 +19,7 @@ import warp as wp
 from warpslam.errors import ConfigError
 from warpslam.runtime.cores import process_cores
 
-_STAGES = ("gauss_newton", "rays", "adam", "compositing", "losses", "grid", "frustum")
+_STAGES = ("gauss_newton", "rays", "adam", "compositing", "losses", "grid", "frustum", "images")
 _PYTHON_MODULES = {
     "warpslam.decoder_cpu": "warpslam.kernels.decoder",
     "warpslam.decoder_cuda": "warpslam.kernels.decoder",

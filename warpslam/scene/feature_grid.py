@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import warp as wp
 
@@ -9,6 +11,20 @@ from warpslam.kernels import grid as grid_kernels
 from warpslam.kernels.grid import Lattice, Vec32
 
 LEVELS = ("coarse", "middle", "fine", "color")
+
+
+@dataclass(frozen=True)
+class GridState:
+    """A `FeatureGrid` as arrays."""
+
+    first: np.ndarray
+    """Lattice index of the first vertex, int64 (3,)."""
+    shape: tuple[int, int, int]
+    """Vertices per axis."""
+    features: np.ndarray
+    """float32 (rows, 32)."""
+    seen: np.ndarray
+    """uint8 (rows,)."""
 
 
 class FeatureGrid:
@@ -24,7 +40,7 @@ class FeatureGrid:
     def __init__(self, level: str, spacing: float, std: float, seed: int, device: wp.Device) -> None:
         self.level, self.spacing, self.std, self.seed, self.device = level, spacing, std, seed, device
         self.first = np.zeros(3, np.int64)
-        self.shape = (0, 0, 0)
+        self.shape: tuple[int, int, int] = (0, 0, 0)
         self.features = wp.zeros(1, dtype=Vec32, device=device)
         self.seen = wp.zeros(1, dtype=wp.uint8, device=device)
         self.lattice = self._lattice()
@@ -42,7 +58,8 @@ class FeatureGrid:
         if self.row_count:
             first = np.minimum(first, self.first)
             last = np.maximum(last, self.first + self.shape - 1)
-        shape = tuple(int(n) for n in last - first + 1)
+        nx, ny, nz = (int(n) for n in last - first + 1)
+        shape = (nx, ny, nz)
         if shape == self.shape:
             return False
         self._resize(first, shape)
@@ -65,12 +82,18 @@ class FeatureGrid:
             record_tape=False,
         )
 
-    def restore(self, first: np.ndarray, shape: tuple[int, int, int], features: np.ndarray, seen: np.ndarray) -> None:
-        """Put back a saved grid: ``features`` float32 (rows, 32), ``seen`` uint8 (rows,)."""
-        self.first, self.shape = np.asarray(first, np.int64), tuple(int(n) for n in shape)
+    def state(self) -> GridState:
+        """The grid as arrays; on the CPU they are its own, not copies."""
+        features, seen = (array.numpy()[: self.row_count] for array in (self.features, self.seen))
+        return GridState(self.first, self.shape, features, seen)
+
+    def restore(self, state: GridState) -> None:
+        """Put back what `state` was."""
+        nx, ny, nz = (int(n) for n in state.shape)
+        self.first, self.shape = np.asarray(state.first, np.int64), (nx, ny, nz)
         self.lattice = self._lattice()
-        self.features = wp.array(np.ascontiguousarray(features, np.float32), dtype=Vec32, device=self.device)
-        self.seen = wp.array(np.ascontiguousarray(seen, np.uint8), dtype=wp.uint8, device=self.device)
+        self.features = wp.array(np.ascontiguousarray(state.features, np.float32), dtype=Vec32, device=self.device)
+        self.seen = wp.array(np.ascontiguousarray(state.seen, np.uint8), dtype=wp.uint8, device=self.device)
 
     def update_from(self, other: FeatureGrid, rows: wp.array | None) -> None:
         """Take over the extent of another grid of this level, and some of its rows: int (n,), None for none."""

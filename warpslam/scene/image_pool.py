@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,9 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.errors import MapSizeError
+from warpslam.kernels import images as image_kernels
+
+_Image = tuple[np.ndarray, np.ndarray, float]
 
 
 class ImagePool:
@@ -30,9 +34,15 @@ class ImagePool:
         self.camera, self.device = camera, device
         image_bytes = 5 * camera.height * camera.width
         self.max_slots = int(min(max_gigabytes * 1e9 / image_bytes, 1 << 30))
-        self.images: list[CompactImage] = []
+        self._kept: list[CompactImage | Future[CompactImage]] = []
         self._slot_of: dict[int, int] = {}  # by image, the one used longest ago first
         self._allocate(max(min(capacity, self.max_slots), 1))
+        size = (camera.height, camera.width)
+        self._metres = wp.zeros(size, dtype=float, device=device)
+        # What slot 0 holds, so that nothing that is here already comes back from the device; None if only that has it.
+        self._current: _Image | None = (np.zeros((*size, 3), np.uint8), np.zeros(size, np.uint16), 0.0)
+        self._upload = _Upload(camera, device) if device.is_cuda else None
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="warpslam-images") if device.is_cuda else None
 
     def _allocate(self, capacity: int) -> None:
         shape = (capacity, self.camera.height, self.camera.width)
@@ -48,28 +58,56 @@ class ImagePool:
     def fork(self) -> ImagePool:
         """A pool with slots of its own that shares the kept images, also those added later: for another thread."""
         other = ImagePool(self.camera, self.device, capacity=self.rgb.shape[0])
-        other.max_slots, other.images = self.max_slots, self.images
+        other.max_slots, other._kept = self.max_slots, self._kept
         return other
 
     def copy_current(self, other: ImagePool) -> None:
         """Put into slot 0 what the other pool holds there."""
         for target, source in zip(self.arrays, other.arrays, strict=True):
             wp.copy(target, source, count=source.size // source.shape[0])
+        self._current = other._current
 
     def set(self, slot: int, rgb: np.ndarray, depth: np.ndarray) -> None:
         """Store an image: uint8 (H, W, 3) and float32 (H, W) [m]."""
-        self._write(slot, rgb, *_quantized(depth))
+        if self._upload is None:
+            self._write(slot, rgb, *_quantized(depth))
+            return
+        self.scale[slot : slot + 1].assign(np.array([_scale(depth)], np.float32))
+        metres = self._upload.start(rgb, depth, self.rgb[slot])
+        inputs = [metres, self.scale[slot : slot + 1], self.depth[slot]]
+        wp.launch(image_kernels.to_units, metres.shape, inputs, device=self.device, record_tape=False)
+        if slot == 0:
+            self._current = None
 
     def add(self, rgb: np.ndarray, depth: np.ndarray) -> int:
         """Keep an image for `bring`; returns its number."""
-        self.images.append(CompactImage.of(rgb, *_quantized(depth)))
-        return len(self.images) - 1
+        self._kept.append(CompactImage.of(rgb, *_quantized(depth)))
+        return len(self._kept) - 1
+
+    def keep_current(self) -> int:
+        """Keep the image of slot 0 for `bring`; returns its number."""
+        current = self.current()
+        self._kept.append(self._worker.submit(CompactImage.of, *current) if self._worker else CompactImage.of(*current))
+        image = len(self._kept) - 1
+        if 1 + len(self._slot_of) < self.rgb.shape[0]:
+            # The next window will want it: a copy now spares unpacking it then.
+            slot = self._slot_of[image] = self._free_slot([])
+            for array in self.arrays:
+                wp.copy(array[slot : slot + 1], array[:1])
+        return image
+
+    def kept(self, image: int) -> CompactImage:
+        """An image that is kept, by its number."""
+        found = self._kept[image]
+        if isinstance(found, Future):
+            found = self._kept[image] = found.result()
+        return found
 
     def bring(self, images: Sequence[int]) -> list[int]:
         """Slots of some images, which are on the device until the next call.
 
         Raises:
-            MapSizeError: they do not fit into the memory set for them.
+            MapSizeError: They do not fit into the memory set for them.
         """
         wanted = list(dict.fromkeys(images))
         if 1 + len(wanted) > self.max_slots:
@@ -83,7 +121,7 @@ class ImagePool:
             slot = self._slot_of.pop(image, None)
             if slot is None:
                 slot = self._free_slot(wanted)
-                self._write(slot, *self.images[image].unpack(self.camera))
+                self._write(slot, *self.kept(image).unpack(self.camera))
             self._slot_of[image] = slot
         return [self._slot_of[image] for image in images]
 
@@ -96,19 +134,32 @@ class ImagePool:
         self.rgb[slot].assign(np.ascontiguousarray(rgb))
         self.depth[slot].assign(depth)
         self.scale[slot : slot + 1].assign(np.array([scale], np.float32))
+        if slot == 0:
+            # The caller's array may be filled with the next frame.
+            self._current = rgb.copy(), depth, float(np.float32(scale))
 
-    def depth_image(self, slot: int) -> np.ndarray:
-        """Depth [m], float32 (H, W)."""
-        return self.depth[slot].numpy().astype(np.float32) * self.scale.numpy()[slot]
+    def metres(self) -> wp.array:
+        """Depth of slot 0 on the device [m], float32 (H, W); good until the next call."""
+        inputs = [self.depth[0], self.scale, self._metres]
+        wp.launch(image_kernels.to_metres, self._metres.shape, inputs, device=self.device, record_tape=False)
+        return self._metres
 
     def current(self) -> tuple[np.ndarray, np.ndarray, float]:
         """What slot 0 holds: colour, uint16 depth, and its scale."""
-        return self.rgb[0].numpy(), self.depth[0].numpy(), float(self.scale.numpy()[0])
+        if self._current is None:
+            rgb, depth, scale = (array[:1].numpy()[0] for array in self.arrays)
+            self._current = rgb, depth, float(scale)
+        return self._current
+
+    def current_depth(self) -> np.ndarray:
+        """Depth of slot 0 as the kernels read it [m], float32 (H, W)."""
+        _, depth, scale = self.current()
+        return depth.astype(np.float32) * np.float32(scale)
 
     def restore(self, current: tuple[np.ndarray, np.ndarray, float], images: list[CompactImage]) -> None:
         """Put back what `current` and `images` were."""
         self._write(0, *current)
-        self.images, self._slot_of = images, {}
+        self._kept, self._slot_of = list(images), {}
 
     @property
     def device_bytes(self) -> int:
@@ -118,7 +169,31 @@ class ImagePool:
     @property
     def compact_bytes(self) -> int:
         """Memory of the compact images."""
-        return sum(len(image.rgb) + len(image.depth) for image in self.images)
+        return sum(len(image.rgb) + len(image.depth) for image in map(self.kept, range(len(self._kept))))
+
+
+class _Upload:
+    """Carries images to a GPU from memory that the device reads by itself."""
+
+    def __init__(self, camera: Intrinsics, device: wp.Device) -> None:
+        size = (camera.height, camera.width)
+        self._rgb = wp.empty((*size, 3), dtype=wp.uint8, device="cpu", pinned=True)
+        self._depth = wp.empty(size, dtype=float, device="cpu", pinned=True)
+        self._metres = wp.empty(size, dtype=float, device=device)
+        self._done = wp.Event(device)
+        self._is_under_way = False
+
+    def start(self, rgb: np.ndarray, depth: np.ndarray, target: wp.array) -> wp.array:
+        """Copy colour to ``target``, and depth to the array that is returned [m], without waiting."""
+        if self._is_under_way:
+            wp.synchronize_event(self._done)
+        np.copyto(self._rgb.numpy(), rgb)
+        np.copyto(self._depth.numpy(), depth)
+        wp.copy(target, self._rgb)
+        wp.copy(self._metres, self._depth)
+        wp.get_stream(self._metres.device).record_event(self._done)
+        self._is_under_way = True
+        return self._metres
 
 
 def check_window_fits(camera: Intrinsics, max_gigabytes: float, window: int) -> None:
@@ -140,12 +215,15 @@ def _too_many_images(camera: Intrinsics, needed: int, slots: int) -> str:
 class CompactImage:
     """An image of the pool, compressed without loss: each value as the difference to its left neighbour, by zlib.
 
-    rgb, depth: Compressed differences; depth has the low bytes of all pixels first. scale: Metres per unit of depth.
+    PNG would be slower, and larger for depth.
     """
 
     rgb: bytes
+    """Compressed differences."""
     depth: bytes
+    """Compressed differences, the low bytes of all pixels first."""
     scale: float
+    """Metres per unit of depth."""
 
     @classmethod
     def of(cls, rgb: np.ndarray, depth: np.ndarray, scale: float) -> CompactImage:
@@ -176,6 +254,11 @@ def _inflated(data: bytes, shape: tuple[int, ...]) -> np.ndarray:
     return np.frombuffer(content, np.uint8).reshape(shape)
 
 
+def _scale(depth: np.ndarray) -> float:
+    """Metres per unit at which the largest depth just fits."""
+    return float(depth.max()) / 65535.0 or 1.0
+
+
 def _quantized(depth: np.ndarray) -> tuple[np.ndarray, float]:
-    scale = float(depth.max()) / 65535.0 or 1.0
+    scale = _scale(depth)
     return np.rint(depth / scale).astype(np.uint16), scale

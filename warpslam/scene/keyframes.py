@@ -15,14 +15,14 @@ OVERLAP_BORDER = 20
 
 @dataclass
 class Keyframe:
-    """A past frame that stays in play.
-
-    index: Frame number. image: Its number in the pool. pose: Pose vector (7,), refined by bundle adjustment.
-    """
+    """A past frame that stays in play."""
 
     index: int
+    """Frame number."""
     image: int
+    """Its number in the pool."""
     pose: np.ndarray
+    """T_world_camera, float64 (4, 4), refined by bundle adjustment."""
 
 
 def overlap_fractions(
@@ -35,8 +35,7 @@ def overlap_fractions(
     """Share of points on the current frame's view rays that each keyframe sees, (keyframes,) in [0, 1].
 
     100 random pixels, 16 points a ray from 0.8 D to D + 0.5 m, projected into every keyframe; the outer 20 pixels of
-    the image do
-    not count.
+    the image do not count.
 
     Args:
         depth: Current depth image [m], (H, W), 0 = missing.

@@ -1,4 +1,4 @@
-"""Adam state for grid rows, the colour decoder and poses (SPEC of the released code: fresh moments for every call)."""
+"""Adam state for grid rows, the colour decoder and poses; moments are fresh in every call, as in the released code."""
 
 from __future__ import annotations
 

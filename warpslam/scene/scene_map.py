@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -16,10 +17,24 @@ from warpslam.field.ray_batch import RayBatch
 from warpslam.runtime.cores import slice_count
 from warpslam.runtime.environment import free_gigabytes
 from warpslam.runtime.phases import phase
-from warpslam.scene.feature_grid import LEVELS, FeatureGrid
+from warpslam.scene.feature_grid import LEVELS, FeatureGrid, GridState
 
 QUERY_CHUNK = 1 << 16
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class SceneState:
+    """A `SceneMap` as arrays."""
+
+    decoders: Decoders
+    """Weights, those of the colour decoder as they are by now."""
+    low: np.ndarray
+    """Lower corner of the bounds [m], float64 (3,)."""
+    high: np.ndarray
+    """Upper corner of the bounds [m], float64 (3,)."""
+    grids: dict[str, GridState]
+    """By level."""
 
 
 class SceneMap:
@@ -46,7 +61,7 @@ class SceneMap:
         """The same map in arrays of its own, which is meant to exist beside this one."""
         other = SceneMap(self.decoder_weights, self.config, self.device, self.seed)
         for level, grid in self.grids.items():
-            other.grids[level].restore(grid.first, grid.shape, grid.features.numpy(), grid.seen.numpy())
+            other.grids[level].restore(grid.state())
         other.update_from(self, {})
         other._buffers = 1 + self._buffers
         return other
@@ -67,9 +82,16 @@ class SceneMap:
         """Lower and upper corner, float64 (3,) each [m]."""
         return self.low, self.high
 
-    def restore_bounds(self, low: np.ndarray, high: np.ndarray) -> None:
-        """Put back saved bounds [m]; the grids are restored one by one."""
-        self.low, self.high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    def state(self) -> SceneState:
+        """The map as arrays; on the CPU those of the grids are its own, not copies."""
+        decoders = replace(self.decoder_weights, color=self.decoders["color"].unpack())
+        return SceneState(decoders, self.low, self.high, {level: grid.state() for level, grid in self.grids.items()})
+
+    def restore(self, state: SceneState) -> None:
+        """Put back what `state` was; the decoders are those that the map was made with."""
+        self.low, self.high = state.low.copy(), state.high.copy()
+        for level, grid in self.grids.items():
+            grid.restore(state.grids[level])
 
     @property
     def is_empty(self) -> bool:
@@ -81,7 +103,7 @@ class SceneMap:
         """Grow the map to hold the box ``low``..``high`` [m] plus the margin; True if it grew.
 
         Raises:
-            MapSizeError: the grown map would not fit `GridConfig.max_gigabytes`, or what is free.
+            MapSizeError: The grown map would not fit `GridConfig.max_gigabytes`, or what is free.
         """
         spacing, margin = self.config.middle_spacing, self.config.margin
         if not self.is_empty and (low > self.low).all() and (high < self.high).all():

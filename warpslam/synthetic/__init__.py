@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from warpslam.synthetic.__main__ import contact_sheet
 from warpslam.synthetic.camera_path import look_at, orbit, room_trajectory, walk
 from warpslam.synthetic.export import SEQUENCE_KINDS, make_sequence, write_sequence
-from warpslam.synthetic.gap import GapSequence
+from warpslam.synthetic.gap import GAP_KINDS, GapSequence
 from warpslam.synthetic.moving import MovingObjectSequence
 from warpslam.synthetic.noise import sensor_noise
 from warpslam.synthetic.render import MeshRenderer, load_mesh
 from warpslam.synthetic.rooms import Room, make_room
 from warpslam.synthetic.sequence import RenderedSequence, SyntheticSequence, write_replica
+from warpslam.synthetic.sheet import contact_sheet
 
 __all__ = [
+    "GAP_KINDS",
     "SEQUENCE_KINDS",
     "GapSequence",
     "MeshRenderer",

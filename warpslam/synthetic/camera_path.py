@@ -25,12 +25,12 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
         T_world_camera, float64, shape (4, 4), OpenCV axes.
 
     Raises:
-        InputError: the view direction is vertical or zero.
+        InputError: The view direction is vertical or zero.
     """
     eye, target = np.asarray(eye, dtype=np.float64), np.asarray(target, dtype=np.float64)
     forward = target - eye
     right = np.cross(forward, [0.0, 0.0, 1.0])
-    if np.linalg.norm(right) < 1e-9 * max(1.0, np.linalg.norm(forward)):
+    if np.linalg.norm(right) < 1e-9 * max(1.0, float(np.linalg.norm(forward))):
         raise InputError(f"look_at from {eye} to {target}: the direction must not be vertical or zero")
     forward = forward / np.linalg.norm(forward)
     right = right / np.linalg.norm(right)
@@ -105,7 +105,7 @@ def walk(
         T_world_camera, float64, shape (frame_count, 4, 4), OpenCV axes.
 
     Raises:
-        InputError: fewer than two waypoints, two alike in a row, or no frame.
+        InputError: Fewer than two waypoints, two alike in a row, or no frame.
     """
     waypoints = np.asarray(waypoints, dtype=np.float64)
     legs = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
@@ -143,7 +143,7 @@ def room_trajectory(room: Room, frame_count: int, seed: int = 0, progress: np.nd
         T_world_camera, float64, shape (frame_count, 4, 4), OpenCV axes.
 
     Raises:
-        InputError: no ellipse of 0.25 m radius fits into the free space.
+        InputError: No ellipse of 0.25 m radius fits into the free space.
     """
     rng = np.random.default_rng(seed)
     center, radii = _widest_ellipse(room)

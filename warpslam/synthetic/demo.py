@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from warpslam.camera import Intrinsics
-
-if TYPE_CHECKING:
-    from warpslam.synthetic import SyntheticSequence
+from warpslam.synthetic.sequence import SyntheticSequence
 
 # Sized so that two CPU cores are done within five minutes, with no kernel compiled beforehand.
 FRAME_COUNT = 60
@@ -24,8 +20,6 @@ OVERRIDES = [
 
 def demo_sequence() -> SyntheticSequence:
     """The sequence of ``warpslam demo``; its ``mesh`` is the true surface."""
-    from warpslam.synthetic import SyntheticSequence
-
     sequence = SyntheticSequence(ROOM_SEED, FRAME_COUNT, intrinsics=INTRINSICS)
     sequence.name = "demo"
     return sequence

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from warpslam.camera import Intrinsics
 from warpslam.errors import ConfigError
@@ -39,18 +40,22 @@ def make_sequence(
         device: Warp device that renders, None = Warp's default one.
 
     Raises:
-        ConfigError: there is no such kind.
-        InputError: the kind can't have so few frames.
+        ConfigError: There is no such kind.
+        InputError: The kind can't have so few frames.
     """
-    places = {"intrinsics": intrinsics, "path_seed": seed, "device": device}
     if kind == "room":
-        return SyntheticSequence(seed, frame_count or 120, **places)
+        return SyntheticSequence(seed, frame_count or 120, intrinsics=intrinsics, path_seed=seed, device=device)
     if kind == "moving":
-        return MovingObjectSequence(seed, frame_count or 100, object_seed=seed, **places)
+        return MovingObjectSequence(
+            seed, frame_count or 100, intrinsics=intrinsics, path_seed=seed, object_seed=seed, device=device
+        )
     if kind == "gap":
         count = frame_count or 220
         length = min(100, count // 2)
-        return GapSequence(seed, count, gap_start=(count - length) // 2, gap_length=length, kind=gap, **places)
+        return GapSequence(
+            seed, count, gap_start=(count - length) // 2, gap_length=length, kind=gap, intrinsics=intrinsics,
+            path_seed=seed, device=device,
+        )  # fmt: skip
     raise ConfigError(f"kind = {kind!r} of sequence is unknown; choose one of {', '.join(SEQUENCE_KINDS)}")
 
 
@@ -62,7 +67,7 @@ def write_sequence(sequence: Truthful, folder: str | Path, *, progress: Callable
     (one row-major object-to-world matrix a line). With a gap: ``lost.txt`` (1 a line where the frame is blacked out).
 
     Raises:
-        DatasetError: the folder already holds frames.
+        DatasetError: The folder already holds frames.
     """
     folder = Path(folder)
     write_replica(sequence, folder, progress=progress)
@@ -71,8 +76,6 @@ def write_sequence(sequence: Truthful, folder: str | Path, *, progress: Callable
     if isinstance(sequence, GapSequence):
         np.savetxt(folder / "lost.txt", sequence.is_lost, fmt="%d")
     if isinstance(sequence, MovingObjectSequence):
-        from PIL import Image
-
         (folder / "masks").mkdir(exist_ok=True)
         for index in range(len(sequence)):
             mask = np.where(sequence.object_mask(index), 255, 0).astype(np.uint8)

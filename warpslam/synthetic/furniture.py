@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from warpslam.synthetic.solids import Solid, yaw_rotation
 from warpslam.synthetic.textures import Material, random_material
@@ -16,18 +18,16 @@ from warpslam.synthetic.textures import Material, random_material
 
 @dataclass
 class Piece:
-    """A piece of furniture under construction.
-
-    rng: Source of all random choices.
-    materials: Materials of the whole room; new ones are appended.
-    solids: Parts in the frame of the piece.
-    """
+    """A piece of furniture under construction."""
 
     rng: np.random.Generator
+    """Source of all random choices."""
     materials: list[Material]
+    """Materials of the whole room; new ones are appended."""
     solids: list[Solid] = field(default_factory=list)
+    """Parts in the frame of the piece."""
 
-    def paint(self, *patterns: str, **options) -> int:
+    def paint(self, *patterns: str, **options: Any) -> int:
         """Add a random material and return its index (options of `random_material`)."""
         if patterns:
             options["patterns"] = patterns
@@ -38,25 +38,46 @@ class Piece:
         """Draw one number."""
         return float(self.rng.uniform(low, high))
 
-    def box(self, low, high, material: int, *, yaw: float = 0.0, tilt: float = 0.0) -> None:
+    def box(self, low: ArrayLike, high: ArrayLike, material: int, *, yaw: float = 0.0, tilt: float = 0.0) -> None:
         """Box between two corners [m], turned about its centre."""
         low, high = np.asarray(low, float), np.asarray(high, float)
         self._add("box", (low + high) / 2, (high - low) / 2, material, yaw, tilt)
 
-    def frustum(self, base, radius, height: float, material: int, *, taper: float = 1.0, yaw=0.0, tilt=0.0) -> None:
+    def frustum(
+        self,
+        base: ArrayLike,
+        radius: ArrayLike,
+        height: float,
+        material: int,
+        *,
+        taper: float = 1.0,
+        yaw: float = 0.0,
+        tilt: float = 0.0,
+    ) -> None:
         """Upright frustum: ``base`` is the centre of its lower disc, ``radius`` one number or (x, y) [m]."""
         rx, ry = np.broadcast_to(radius, 2)
         center = np.asarray(base, float) + [0, 0, height / 2]
         self._add("frustum", center, np.array([rx, ry, height / 2]), material, yaw, tilt, taper)
 
-    def ellipsoid(self, center, half, material: int, *, yaw: float = 0.0, tilt: float = 0.0) -> None:
+    def ellipsoid(
+        self, center: ArrayLike, half: ArrayLike, material: int, *, yaw: float = 0.0, tilt: float = 0.0
+    ) -> None:
         """Ellipsoid; ``half`` is one radius or three [m]."""
         self._add("ellipsoid", np.asarray(center, float), np.broadcast_to(half, 3).astype(float), material, yaw, tilt)
 
-    def _add(self, kind, center, half, material, yaw, tilt, taper=1.0) -> None:
+    def _add(
+        self,
+        kind: str,
+        center: np.ndarray,
+        half: np.ndarray,
+        material: int,
+        yaw: float,
+        tilt: float,
+        taper: float = 1.0,
+    ) -> None:
         self.solids.append(Solid(kind, center, yaw_rotation(yaw, tilt), np.asarray(half, float), material, taper))
 
-    def things_on(self, low, high, z: float, count: int, *, tall: float = 0.3) -> None:
+    def things_on(self, low: ArrayLike, high: ArrayLike, z: float, count: int, *, tall: float = 0.3) -> None:
         """Stand up to ``count`` small objects on the rectangle ``low``-``high`` (x, y) [m] at height ``z``."""
         low, high = np.asarray(low, float), np.asarray(high, float)
         taken: list[np.ndarray] = []

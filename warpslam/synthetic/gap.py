@@ -53,7 +53,7 @@ class GapSequence(RenderedSequence):
             device: Warp device that renders, None = Warp's default one.
 
         Raises:
-            InputError: the kind is unknown, or the gap leaves no frame before or after it.
+            InputError: The kind is unknown, or the gap leaves no frame before or after it.
         """
         if kind not in GAP_KINDS:
             raise InputError(f"kind = {kind!r} must be one of {', '.join(GAP_KINDS)}")

@@ -58,7 +58,7 @@ class MovingObjectSequence(RenderedSequence):
             device: Warp device that renders, None = Warp's default one.
 
         Raises:
-            InputError: there are too few frames, or nowhere in view is room for the object to move.
+            InputError: There are too few frames, or nowhere in view is room for the object to move.
         """
         if frame_count < 10:
             raise InputError(f"frame_count = {frame_count} must be at least 10 for an object to move")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from PIL import Image
 
 from warpslam.camera import Intrinsics
 from warpslam.errors import ConfigError, MeshError
@@ -23,29 +24,27 @@ TEXTURE_LIMIT = 512
 
 @dataclass(frozen=True)
 class ColoredTriangles:
-    """Triangles with a colour from their vertices or from a texture.
-
-    vertices: Positions [m], float32, shape (V, 3).
-    faces: Vertex indices, int32, shape (F, 3).
-    colors: Vertex colours 0..255, float32, shape (V, 3).
-    uvs: Texture coordinates, float32, shape (V, 2); v = 1 is an image's top row.
-    material: Index of a face's texture, int32, shape (F,); -1 = vertex colours.
-    textures: RGB images, uint8, each of shape (h, w, 3).
-    """
+    """Triangles with a colour from their vertices or from a texture."""
 
     vertices: np.ndarray
+    """Positions [m], float32, shape (V, 3)."""
     faces: np.ndarray
+    """Vertex indices, int32, shape (F, 3)."""
     colors: np.ndarray
+    """Vertex colours 0..255, float32, shape (V, 3)."""
     uvs: np.ndarray
+    """Texture coordinates, float32, shape (V, 2); v = 1 is an image's top row."""
     material: np.ndarray
+    """Index of a face's texture, int32, shape (F,); -1 = vertex colours."""
     textures: list[np.ndarray]
+    """RGB images, uint8, each of shape (h, w, 3)."""
 
     @classmethod
     def from_trimesh(cls, mesh: trimesh.Trimesh | trimesh.Scene) -> ColoredTriangles:
         """Flatten a mesh, or a scene of several, keeping each face's own texture.
 
         Raises:
-            MeshError: there is no triangle, or a vertex is not finite.
+            MeshError: There is no triangle, or a vertex is not finite.
         """
         parts = mesh.dump() if hasattr(mesh, "dump") else [mesh]
         parts = [part for part in parts if hasattr(part, "faces") and len(part.faces)]
@@ -95,9 +94,7 @@ def _flatten(part: trimesh.Trimesh, textures: list[np.ndarray]) -> tuple[np.ndar
     return np.asarray(part.vertices), np.asarray(part.faces), colors, uvs, material
 
 
-def _texture(image) -> np.ndarray:
-    from PIL import Image
-
+def _texture(image: Image.Image) -> np.ndarray:
     image = image.convert("RGB")
     shrink = TEXTURE_LIMIT / max(image.size)
     if shrink < 1:
@@ -128,7 +125,7 @@ class MeshRenderer:
             light: Direction to the light in world axes; need not have unit length.
             max_depth: Hits beyond this z-depth [m] are misses.
         """
-        import warp as wp
+        import warp as wp  # rooms and paths, which the package brings too, need none of it
 
         direction = np.asarray(light, dtype=np.float64)
         if direction.shape != (3,) or not np.linalg.norm(direction) > 0:
@@ -200,7 +197,7 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh | trimesh.Scene:
     """Load a mesh file with its materials.
 
     Raises:
-        MeshError: the file is missing or cannot be read.
+        MeshError: The file is missing or cannot be read.
     """
     import trimesh
 

@@ -5,6 +5,7 @@ A room is a union of analytic solids. Its walls, floor and ceiling are solids to
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -26,20 +27,19 @@ _SURFACE_STEP = 1e-3  # [m] distance at which a surface point is tested for bein
 class Room:
     """A union of solids, with colours.
 
-    solids: Parts in room coordinates [m], z up, floor at z = 0.
-    materials: What ``Solid.material`` points into.
-    interior: Box of the space inside the outer shell, recesses included, room coordinates [m], shape (2, 3).
-    offset: World position of the room's origin [m], shape (3,).
-    wall: Thickness of the outer shell [m].
-
     All public methods take and return world coordinates.
     """
 
     solids: list[Solid]
+    """Parts in room coordinates [m], z up, floor at z = 0."""
     materials: list[Material]
+    """What ``Solid.material`` points into."""
     interior: np.ndarray
+    """Box of the space inside the outer shell, recesses included, room coordinates [m], shape (2, 3)."""
     offset: np.ndarray
+    """World position of the room's origin [m], shape (3,)."""
     wall: float
+    """Thickness of the outer shell [m]."""
 
     @property
     def bounds(self) -> np.ndarray:
@@ -141,7 +141,8 @@ class Room:
             found.append((points[keep][:missing], normals[keep][:missing], part[face][keep][:missing]))
             missing -= len(found[-1][0])
         if not found:
-            return tuple(np.empty((0, 3), dtype=np.float32) for _ in range(3))
+            empty = np.empty((0, 3), dtype=np.float32)
+            return empty, empty.copy(), empty.copy()
         points, normals, parts = (np.concatenate(column) for column in zip(*found, strict=True))
         # The acceptance order is that of the draws, so no shuffle is needed.
         points = points + self.offset
@@ -152,7 +153,7 @@ class Room:
 
         Triangles that another solid covers are left out, partly covered ones are kept whole.
         """
-        import trimesh
+        import trimesh  # takes a second, and rooms without a mesh need none of it
 
         surface, part = self._visible_surface(spacing)
         used, faces = np.unique(surface.faces, return_inverse=True)
@@ -218,10 +219,10 @@ def make_room(seed: int, *, furniture: bool = True, offset: tuple[float, float, 
         furniture: False leaves only the shell (walls, floor, ceiling, doors, windows).
         offset: World position of the room's origin, a corner on the floor [m].
     """
-    offset = np.asarray(offset, dtype=np.float64)
-    if offset.shape != (3,) or not np.isfinite(offset).all():
-        raise InputError(f"offset = {offset!r} must be three finite numbers")
-    return _RoomBuilder(np.random.default_rng(seed)).build(furniture, offset)
+    origin = np.asarray(offset, dtype=np.float64)
+    if origin.shape != (3,) or not np.isfinite(origin).all():
+        raise InputError(f"offset = {origin!r} must be three finite numbers")
+    return _RoomBuilder(np.random.default_rng(seed)).build(furniture, origin)
 
 
 @dataclass(frozen=True)
@@ -231,6 +232,10 @@ class _Recess:
     kind: str
     u: tuple[float, float]
     z: tuple[float, float]
+
+
+DrawPose = Callable[[np.ndarray, np.ndarray], tuple[float, np.ndarray]]
+"""Yaw and position of a piece whose box has these corners."""
 
 
 class _RoomBuilder:
@@ -378,7 +383,7 @@ class _RoomBuilder:
         self._hang_pictures()
         self._hang_lamps()
 
-    def _place(self, builder: PieceBuilder, draw_pose) -> None:
+    def _place(self, builder: PieceBuilder, draw_pose: DrawPose) -> None:
         piece = Piece(self.rng, self.materials)
         builder(piece)
         boxes = np.stack([solid.bounds for solid in piece.solids])

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from warpslam.camera import Intrinsics
 from warpslam.errors import DatasetError, InputError
@@ -104,11 +105,9 @@ def write_replica(sequence: RgbdSequence, folder: str | Path, *, progress: Calla
         progress: Called with the index of each frame written.
 
     Raises:
-        DatasetError: the folder already holds frames.
-        InputError: a frame has no ground-truth pose.
+        DatasetError: The folder already holds frames.
+        InputError: A frame has no ground-truth pose.
     """
-    from PIL import Image
-
     folder = Path(folder)
     results = folder / "results"
     if results.is_dir() and any(results.iterdir()):

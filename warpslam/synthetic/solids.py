@@ -18,22 +18,20 @@ _CHORD_ERROR = 0.001  # largest distance [m] between a curved surface and its tr
 
 @dataclass(frozen=True)
 class Solid:
-    """One solid part.
-
-    kind: "box", "frustum" or "ellipsoid".
-    center: Centre of the solid [m], shape (3,).
-    rotation: Solid-to-room rotation, shape (3, 3).
-    half: Half sizes [m], shape (3,); of a frustum its bottom radii and half height.
-    material: Index of its material.
-    taper: Top radius over bottom radius of a frustum.
-    """
+    """One solid part."""
 
     kind: str
+    """"box", "frustum" or "ellipsoid"."""
     center: np.ndarray
+    """Centre of the solid [m], shape (3,)."""
     rotation: np.ndarray
+    """Solid-to-room rotation, shape (3, 3)."""
     half: np.ndarray
+    """Half sizes [m], shape (3,); of a frustum its bottom radii and half height."""
     material: int
+    """Index of its material."""
     taper: float = 1.0
+    """Top radius over bottom radius of a frustum."""
 
     @property
     def extent(self) -> np.ndarray:
@@ -95,16 +93,14 @@ class Solid:
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles, counter-clockwise from outside.
-
-    vertices: Positions [m], shape (V, 3).
-    faces: Vertex indices, shape (F, 3).
-    curved: Whether a triangle stands for a curved piece, shape (F,).
-    """
+    """Triangles, counter-clockwise from outside."""
 
     vertices: np.ndarray
+    """Positions [m], shape (V, 3)."""
     faces: np.ndarray
+    """Vertex indices, shape (F, 3)."""
     curved: np.ndarray
+    """Whether a triangle stands for a curved piece, shape (F,)."""
 
     @classmethod
     def joined(cls, surfaces: list[Surface]) -> Surface:
@@ -164,11 +160,11 @@ def _frustum_patches(half: np.ndarray, taper: float, spacing: float) -> list[Sur
     angle = 2 * np.pi * u
     side = np.column_stack([scale * half[0] * np.cos(angle), scale * half[1] * np.sin(angle), (2 * v - 1) * half[2]])
     patches = [Surface(side, faces, np.ones(len(faces), bool))]
-    for end, scale in ((-1.0, 1.0), (1.0, taper)):
-        u, v, faces = _grid(_cells(max(half[0], half[1]) * scale, spacing), ring)
+    for end, size in ((-1.0, 1.0), (1.0, taper)):
+        u, v, faces = _grid(_cells(max(half[0], half[1]) * size, spacing), ring)
         angle = 2 * np.pi * v
         cap = np.column_stack(
-            [u * scale * half[0] * np.cos(angle), u * scale * half[1] * np.sin(angle), np.full(len(u), end * half[2])]
+            [u * size * half[0] * np.cos(angle), u * size * half[1] * np.sin(angle), np.full(len(u), end * half[2])]
         )
         patches.append(Surface(cap, faces if end > 0 else faces[:, ::-1], np.zeros(len(faces), bool)))
     return patches

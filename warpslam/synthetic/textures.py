@@ -11,22 +11,20 @@ PATTERNS = ("checker", "stripes", "blotches", "bricks", "wood", "dots")
 
 @dataclass(frozen=True)
 class Material:
-    """A two-colour pattern with noise on top.
-
-    pattern: One of `PATTERNS`.
-    colors: The two colours, shape (2, 3), in [0, 1].
-    scale: Size of a pattern cell [m].
-    rotation: World-to-pattern rotation, shape (3, 3).
-    phase: Shift of the pattern, shape (3,), in cells.
-    noise: Amplitude of the noise added to the brightness.
-    """
+    """A two-colour pattern with noise on top."""
 
     pattern: str
+    """One of `PATTERNS`."""
     colors: np.ndarray
+    """The two colours, shape (2, 3), in [0, 1]."""
     scale: float
+    """Size of a pattern cell [m]."""
     rotation: np.ndarray
+    """World-to-pattern rotation, shape (3, 3)."""
     phase: np.ndarray
+    """Shift of the pattern, shape (3,), in cells."""
     noise: float
+    """Amplitude of the noise added to the brightness."""
 
     def color_at(self, points: np.ndarray) -> np.ndarray:
         """Colours in [0, 1], float32, shape (N, 3), at ``points`` [m], shape (N, 3)."""

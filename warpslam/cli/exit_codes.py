@@ -1,0 +1,6 @@
+"""What the command returns to the shell, besides 0 and what single commands add."""
+
+EXIT_ERROR = 2
+"""Something that the user can put right stopped it."""
+EXIT_INTERRUPTED = 130
+"""Ctrl-C."""

@@ -1,0 +1,9 @@
+"""Programs to start from, each of them a page: ``python -m warpslam.examples.first_steps``.
+
+All run without data, in a rendered room, in less than a minute once the kernels are compiled.
+
+    first_steps         a sequence in, trajectory and mesh out
+    own_camera          a loop over the arrays of one's own camera, with frames that are no use
+    known_poses         a map from poses that are known, and views of it
+    localize_in_a_map   a saved map, in which a camera finds its place
+"""

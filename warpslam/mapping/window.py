@@ -1,0 +1,51 @@
+"""The frames of a mapping call (Sec. 3.4): keyframes that see what the current frame sees, and the last keyframe."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from warpslam.camera import Intrinsics
+from warpslam.runtime.phases import phase
+from warpslam.scene.keyframes import Keyframe, overlap_fractions
+
+
+@phase("keyframe selection")
+def overlapping_window(
+    keyframes: list[Keyframe],
+    size: int,
+    rng: np.random.Generator,
+    depth: np.ndarray,
+    T_world_camera: np.ndarray,
+    camera: Intrinsics,
+) -> list[Keyframe]:
+    """Up to ``size`` - 2 random keyframes of those that see what the current frame sees, and the last keyframe.
+
+    Args:
+        keyframes: All of them, in their order.
+        size: Frames of the window, the current one included.
+        rng: Chooses.
+        depth: Current depth image [m], (H, W).
+        T_world_camera: Current pose (4, 4).
+        camera: Intrinsics.
+    """
+    if not keyframes or size < 2:
+        return []
+    *candidates, last = keyframes
+    if candidates:
+        poses = [keyframe.pose for keyframe in candidates]
+        fractions = overlap_fractions(depth, T_world_camera, poses, camera, rng)
+        candidates = [keyframe for keyframe, fraction in zip(candidates, fractions, strict=True) if fraction > 0]
+    return [*_some(candidates, size - 2, rng), last]
+
+
+@phase("keyframe selection")
+def random_window(keyframes: list[Keyframe], size: int, rng: np.random.Generator) -> list[Keyframe]:
+    """Up to ``size`` - 2 random keyframes, and the last one."""
+    if not keyframes or size < 2:
+        return []
+    *candidates, last = keyframes
+    return [*_some(candidates, size - 2, rng), last]
+
+
+def _some(keyframes: list[Keyframe], count: int, rng: np.random.Generator) -> list[Keyframe]:
+    return [keyframes[n] for n in rng.permutation(len(keyframes))[: max(count, 0)]]
