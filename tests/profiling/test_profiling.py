@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections import Counter, namedtuple
 
 import numpy as np
@@ -64,7 +63,7 @@ def run(frames):
     """A run with two slices on any machine, profiled from the first frame to the mesh."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(recorder, "matrix_peak_gflops", lambda: 100.0)
-        patch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
+        patch.setattr("psutil.Process.cpu_affinity", lambda self: [0, 1], raising=False)
         slam = new_slam(*SETTINGS)
         with warpslam.profile() as profile:
             timings = [result.timings for result in steps(slam, frames)]
