@@ -216,7 +216,8 @@ class Runner:
 
         for argument, value in zip(kernel.adj.args, values, strict=True):
             params.append(_object(wpc.pack_arg(kernel, argument.type, argument.label, value, device, False)))
-            add(value)
+            for array in _arrays(value):
+                add(array)
             if isinstance(value, wp.array):
                 add(value.grad)
         if gradients is not None:
@@ -268,6 +269,12 @@ def _extent(array: Any) -> int:
     return last + wp.types.type_size_in_bytes(array.dtype)
 
 
+def _arrays(value: Any) -> list[Any]:
+    """The argument itself, or what a struct holds."""
+    fields = getattr(getattr(value, "_cls", None), "vars", None)
+    return [value] if fields is None else [array for name in fields for array in _arrays(getattr(value, name))]
+
+
 def _object(value: Any) -> Any:
     """Something with an address."""
     if isinstance(value, ctypes._SimpleCData | ctypes.Structure | ctypes.Array):
@@ -299,7 +306,7 @@ def install(**options: bool) -> Runner:
     """
     import warp as wp
 
-    from warpslam.field import passes, ray_batch
+    from warpslam.field import ray_batch
     from warpslam.runtime import cores, program
 
     runner, original = Runner(**options), wp.launch
@@ -332,7 +339,6 @@ def install(**options: bool) -> Runner:
     _replace(cores.slice_count, lambda device: 1)
     kernels_of = ray_batch.decoders_for
     _replace(kernels_of, lambda device: kernels_of(SimpleNamespace(is_cuda=True)))
-    passes.GROUP_SIZE["cpu"] = passes.GROUP_SIZE["cuda"]
     return runner
 
 
