@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import shutil
 import subprocess
@@ -20,24 +21,26 @@ SPILLING = {
     "color_backward": (16, "holds the gradients of two layers for the weights of the embedding"),
     "layer_weights": (1200, "of the baseline: sums eight rows of 32 at once"),
 }
-BUILT = {"warpslam.decoder_cuda": "warpslam.kernels.decoder", "warpslam.imap_cuda": "warpslam.kernels.imap_network"}
-"""Warp modules that a function builds, and the Python modules that call it."""
+BUILT = ("warpslam.decoder_cuda", "warpslam.imap_cuda")
+"""Warp modules whose kernels a function builds."""
 
 
 def kernel_modules() -> list[str]:
     """Names of the Warp modules that hold kernels, those that a function builds included."""
     root = Path(warpslam.__file__).parent
-    names = [
-        ".".join(("warpslam", *path.relative_to(root).with_suffix("").parts))
-        for path in sorted(root.rglob("*.py"))
-        if re.search(r"^@wp\.kernel", path.read_text(), re.MULTILINE)
-    ]
-    return [*names, *BUILT]
+    names = []
+    for path in sorted(root.rglob("*.py")):
+        if re.search(r"^@wp\.kernel", path.read_text(), re.MULTILINE):
+            python = importlib.import_module(".".join(("warpslam", *path.relative_to(root).with_suffix("").parts)))
+            names += [kernel.module.name for kernel in vars(python).values() if isinstance(kernel, wp.Kernel)]
+    return [*dict.fromkeys(names), *BUILT]
 
 
 def test_every_kernel_module_is_found():
     """The list of modules holds the known ones, so that the test below can't pass by looking at nothing."""
-    assert {f"warpslam.kernels.{stage}" for stage in ("rays", "compositing", "losses", "adam")} <= set(kernel_modules())
+    assert {f"warpslam.{name}" for name in ("rays", "views", "kernels.compositing", "kernels.adam")} <= set(
+        kernel_modules()
+    )
 
 
 def test_a_run_compiles_every_module_beforehand():

@@ -26,7 +26,7 @@ from warpslam.runtime.compilation import (
 from warpslam.synthetic import SyntheticSequence
 
 CPU = wp.get_device("cpu")
-SMALL = ["warpslam.kernels.frustum"]
+SMALL = ["warpslam.views"]
 """A module that compiles in half a second."""
 
 

@@ -12,9 +12,8 @@ from warpslam.field.arrays import struct
 from warpslam.field.complexity import imap_shapes
 from warpslam.field.decoders import EMBEDDING_SCALE
 from warpslam.field.ray_batch import RayBatch
-from warpslam.kernels import imap_density as density
+from warpslam.kernels import imap_density, rays
 from warpslam.kernels import imap_network as imap
-from warpslam.kernels import rays
 from warpslam.kernels.compositing import Box
 from warpslam.kernels.grid import Vec32
 from warpslam.kernels.samples import Span
@@ -148,10 +147,10 @@ class ImapBatch(RayBatch):
         return self.logit
 
     @property
-    def composited(self) -> density.Composited:
+    def composited(self) -> imap_density.Composited:
         """The samples as compositing takes them."""
         return struct(
-            density.Composited,
+            imap_density.Composited,
             order=self.order,
             density=self.density,
             color=self.color,
@@ -182,18 +181,18 @@ class ImapBatch(RayBatch):
             ray_count = stop - first
             inputs = [first, self.draws, int(jitter), self.stratified, int(use_depth)]
             inputs += [self.measured_depth, self.t_exit, self.max_depth, self.rays]
-            result: list[Step] = [(density.place_stratified, ray_count, inputs)]
+            result: list[Step] = [(imap_density.place_stratified, ray_count, inputs)]
             if self.empty:
                 inputs = [first, self.draws, self.visible, self.empty, self.measured_depth, self.rays]
-                result.append((density.place_empty, ray_count, inputs))
+                result.append((imap_density.place_empty, ray_count, inputs))
             result += self._forward(network, first, stop, 0, self.stratified)
             inputs = [first, self.stratified, self.importance, self.keep, *corners]
             inputs += [self.density, self.weight, self.order]
-            result.append((density.place_importance, ray_count, inputs))
+            result.append((imap_density.place_importance, ray_count, inputs))
             result += self._forward(network, first, stop, self.stratified, samples - self.stratified)
             inputs = [first, self.visible, self.keep, *corners, self.composited]
             inputs += [self.depth, self.variance, self.rgb]
-            result.append((density.composite, ray_count, inputs))
+            result.append((imap_density.composite, ray_count, inputs))
             return result
 
         self.launcher.slices(self.count, steps)
@@ -205,7 +204,7 @@ class ImapBatch(RayBatch):
     def add_empty_loss(self, empty_weight: float) -> None:
         """Add the sum of ``empty_weight`` |density| over the empty samples to `loss`."""
         inputs = [self.visible, self.sample_count, empty_weight, self.keep, self.density, self.loss]
-        self.launcher.launch(density.empty_loss, self.count, inputs)
+        self.launcher.launch(imap_density.empty_loss, self.count, inputs)
 
     def query_points(self, network: ImapNetwork, points: np.ndarray) -> None:
         """Density and colour at points (N, 3) in network units; needs a batch of one sample a ray."""
@@ -235,7 +234,7 @@ class ImapBatch(RayBatch):
         span = struct(Span, point_count=count, first_ray=first, first_sample=0, width=samples)
         parts = struct(imap.Chunks, start=start, stop=end, size=_CHUNK, slot=slot)
         gradient = struct(
-            density.CompositeGradient,
+            imap_density.CompositeGradient,
             depth_grad=self.depth.grad,
             rgb_grad=self.rgb.grad,
             density_grad=self.logit_grad,
@@ -243,7 +242,7 @@ class ImapBatch(RayBatch):
         )
         inputs = [first, self.visible, self.keep, struct(Box, low=bound.low, high=bound.high), self.rays]
         inputs += [self.composited, empty_weight, gradient]
-        result: list[Step] = [(density.composite_backward, stop - first, inputs)]
+        result: list[Step] = [(imap_density.composite_backward, stop - first, inputs)]
         d, other = self._d
         inputs = [start, W, self.layers[-1], self.color_grad, self.logit_grad, d]
         result.append((kernels.output_backward, count, inputs))

@@ -76,7 +76,8 @@ class Gradients:
     grids: by level.
     points: sample positions, and through them rays and poses.
     color_weights: (slices, rows) buffers of `Vec32` for the colour decoder, or None.
-    inliers_move: only those rays reach the poses that `field.objectives.choose_inliers` chooses after the rendering.
+    inliers_move: only those rays reach the poses that `warpslam.field.objectives.choose_inliers` chooses after the
+        rendering.
     """
 
     grids: dict[str, GridGradient] = field(default_factory=dict)

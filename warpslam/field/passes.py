@@ -17,8 +17,6 @@ from warpslam.runtime.launching import Step
 from warpslam.runtime.program import run_slices
 
 STAGES = ("coarse", "middle", "fine", "color")
-GROUP_SIZE = {"cpu": 8, "cuda": 16}
-"""Samples of a ray between two looks at its transmittance."""
 
 
 def query(batch: RayBatch, arrays: FieldArrays, stage: str) -> None:
@@ -53,7 +51,7 @@ def render(
     if weights is not None:
         batch.make_room_for_activations()
     samples = batch.sample_count
-    width = GROUP_SIZE["cuda" if batch.device.is_cuda else "cpu"] if thresholds.min_transmittance > 0 else samples
+    width = batch.kernels.group_size if thresholds.min_transmittance > 0 else samples
 
     def steps(first: int, stop: int, slot: int) -> list[Step]:
         ray_count = stop - first

@@ -17,7 +17,7 @@ launches go through a `warpslam.runtime.launching.Launcher`, which can record an
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -49,7 +49,7 @@ class RayBatch:
         self.sample_count = 0
         points = capacity * max_samples
 
-        def zeros(shape, dtype=float, grad: bool = False) -> wp.array:
+        def zeros(shape: int, dtype: Any = float, grad: bool = False) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device, requires_grad=grad)
 
         self.frame = zeros(capacity, int)

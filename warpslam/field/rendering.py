@@ -79,7 +79,7 @@ def _render(
         count = min(rows, height - first)
         batch.set_pixels(first, count, camera, stride)
         batch.cast(pose)
-        if guided:
+        if depth is not None:
             batch.measured_depth[: batch.count].assign(depth[first : first + count].reshape(-1))
         batch.bound(arrays, use_depth=guided)
         batch.place_samples(stratified, sampling.surface, use_depth=guided)

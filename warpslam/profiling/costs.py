@@ -49,7 +49,7 @@ NOTHING = Work()
 class Arguments:
     """Arguments of a launch by name, fields of structs as ``argument.field``.
 
-    They are either packed for the CPU (``values`` ctypes) or as they were given.
+    They are packed for the CPU (``values`` ctypes), or as they were given.
     """
 
     def __init__(self, kernel: wp.Kernel, values: Sequence[Any], *, readable: bool) -> None:

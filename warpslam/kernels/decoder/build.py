@@ -8,7 +8,7 @@ from warpslam.kernels.decoder.blocks import Build
 from warpslam.kernels.decoder.coarse import coarse_kernels
 from warpslam.kernels.decoder.color import color_kernels
 from warpslam.kernels.decoder.geometry import geometry_kernels
-from warpslam.kernels.decoder.layout import WEIGHT_GROUP
+from warpslam.kernels.decoder.layout import GROUP_SIZE, WEIGHT_GROUP
 
 
 def decoder_kernels(target: str) -> SimpleNamespace:
@@ -22,6 +22,8 @@ def decoder_kernels(target: str) -> SimpleNamespace:
         **geometry_kernels(build),
         **color_kernels(build),
         **coarse_kernels(build),
+        # Samples of a ray between two looks at its transmittance.
+        group_size=GROUP_SIZE[target],
         # Blocks of a thread of `color_backward`.
         color_blocks=WEIGHT_GROUP // build.size if build.on_cpu else 1,
         # Threads of a launch over so many samples, one block each.

@@ -43,6 +43,9 @@ MASK_WORDS = 5
 BLOCK_SIZE = {"cpu": 4, "cuda": 1}
 """Samples of a block."""
 
+GROUP_SIZE = {"cpu": 8, "cuda": 16}
+"""Samples of a ray between two looks at its transmittance."""
+
 WEIGHT_GROUP = 16
 """Samples that a CPU thread of `color_backward` sums weight gradients over before it adds them to memory."""
 
