@@ -128,8 +128,7 @@ def visible_points(
         x, y, z = ((points[rest] - t) @ R).T
         in_front = z > 1e-6
         rest, x, y, z = rest[in_front], x[in_front], y[in_front], z[in_front]
-        column = np.rint(intrinsics.fx * x / z + intrinsics.cx)
-        row = np.rint(intrinsics.fy * y / z + intrinsics.cy)
+        column, row = map(np.rint, intrinsics.project(x, y, z))
         inside = (column >= 0) & (column < intrinsics.width) & (row >= 0) & (row < intrinsics.height)
         if depth is not None:
             surface = depth[row[inside].astype(int), column[inside].astype(int)]

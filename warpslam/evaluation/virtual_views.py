@@ -149,7 +149,7 @@ def _counted(depth: np.ndarray, camera: Intrinsics, T_world_camera: np.ndarray, 
     """Which pixels of a true depth image (H, W) show surface that counts, bool (H, W)."""
     v, u = np.nonzero(depth)
     z = depth[v, u].astype(np.float64)
-    local = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
+    local = camera.backproject(u, v, z)
     counted = np.zeros(depth.shape, dtype=bool)
     counted[v, u] = culling.keeps(local @ T_world_camera[:3, :3].T + T_world_camera[:3, 3])
     return counted

@@ -19,6 +19,7 @@ from warpslam.frames import exposure_fault, read_images
 from warpslam.sequences.base import Frame, RgbdSequence
 from warpslam.sequences.files import FileSequence, frame_number
 from warpslam.sequences.pose_convention import CONVENTIONS, EXPECTED, DepthView, agreement, moving_pairs
+from warpslam.spread import spread
 
 OK, WARNING, ERROR = "ok", "warning", "error"
 MAX_DEPTH = 10.0
@@ -132,7 +133,7 @@ def check_sequence(
     """
     frames = range(len(sequence)) if frames is None else frames
     count = len(frames) if sample_count is None else min(sample_count, len(frames))
-    chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
+    chosen = [frames[i] for i in spread(len(frames), count)]
     samples = [_sample(sequence, index) for index in chosen]
     findings = [*_check_frames(samples), *_check_files(sequence, frames, thorough), *_check_times(sequence, frames)]
     good = [sample.frame for sample in samples if sample.frame is not None]
