@@ -134,12 +134,12 @@ def test_warmup_prints_a_line_a_module(empty_cache, monkeypatch, capsys):
 def test_run_shows_and_records_what_it_compiles(empty_cache, monkeypatch, tmp_path, capsys):
     """Without a terminal a line before each module that must be compiled; metrics and timing name them."""
     from tests.fakes import FakeSlam
-    from warpslam.pipeline import finished as revisit
     from warpslam.storage.json_files import read_json
 
-    monkeypatch.setattr(pipeline, "build_slam", lambda intrinsics, config, device, seed: FakeSlam(intrinsics))
-    monkeypatch.setattr(pipeline._Run, "_draw_plots", lambda self: None)
-    monkeypatch.setattr(revisit, "open_source", lambda source: FakeSequence(3))
+    monkeypatch.setattr(pipeline, "build_slam", lambda intrinsics, config, device, seed, method: FakeSlam(intrinsics))
+    monkeypatch.setattr(pipeline, "draw_plots", lambda *arguments: None)
+    monkeypatch.setattr(pipeline, "draw_panels", lambda *arguments: None)
+    monkeypatch.setattr(pipeline, "open_source", lambda source: FakeSequence(3))
     for name, compiled in (("first", SMALL), ("second", [])):
         assert cli.main(["run", "seq", "--device", "cpu", "-o", str(tmp_path / name)]) == 0
         out = capsys.readouterr().out

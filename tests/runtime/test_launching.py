@@ -53,7 +53,7 @@ def test_gradients_of_two_threads_equal_those_of_one(two_slices):
 
 
 @wp.kernel
-def square(x: wp.array(dtype=float), factor: float, y: wp.array(dtype=float)):
+def square(x: wp.array[float], factor: float, y: wp.array[float]):
     tid = wp.tid()
     wp.atomic_add(y, 0, factor * x[tid] * x[tid])
 

@@ -93,7 +93,7 @@ def _connect(ray: Any, address: str) -> None:
 
 def _task(job: dict[str, Any], output: str, memory_gb: float | None, threads: int, news: Any) -> str:
     """Runs on a worker."""
-    # Ray counts cores and leaves it to the task to use no more of them.
+    # Ray counts cores and leaves it to the task to use no more of them; set before Warp is loaded.
     os.environ["WARPSLAM_THREADS"] = str(threads)
     from warpslam.batch.worker import execute
 

@@ -18,32 +18,14 @@ from warpslam.evaluation import (
     trajectory_metrics,
 )
 from warpslam.pipeline.results import render_panel
-from warpslam.pipeline.setup import load_slam
+from warpslam.pipeline.setup import load_slam, open_source
 from warpslam.runs.folder import RunFolder
-from warpslam.runs.request import Source
 from warpslam.spread import spread
 from warpslam.storage.json_files import read_json
 from warpslam.storage.tum import associate, read_tum
 
 if TYPE_CHECKING:
     import trimesh
-
-    from warpslam.sequences.base import RgbdSequence
-
-
-def open_source(source: Source) -> RgbdSequence:
-    """Open the input of a run again.
-
-    Raises:
-        DatasetError: The folder is gone or can't be read any more.
-    """
-    if source.path is None:
-        from warpslam.synthetic.demo import demo_sequence
-
-        return demo_sequence()
-    from warpslam.sequences import open_sequence
-
-    return open_sequence(source.path, dataset=source.dataset, camera=source.camera)
 
 
 def evaluate_run(

@@ -25,14 +25,16 @@ MIN_KEPT = 0.2  # of the faces; where the cut leaves fewer, it was no ceiling
 
 @dataclass(frozen=True)
 class MeshView:
-    """A picture of the mesh.
-
-    title: What it shows. uri: The picture. path: Where the cameras appear in it [px], shape (N, 2), or None.
-    """
+    """A picture of the mesh."""
 
     title: str
+    """What it shows."""
+
     uri: str
+    """The picture."""
+
     path: np.ndarray | None = None
+    """Where the cameras appear in it [px], shape (N, 2), or None."""
 
 
 def data_uri(image: np.ndarray) -> str:
