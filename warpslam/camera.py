@@ -14,11 +14,17 @@ class Intrinsics:
     """Pinhole intrinsics in pixels; pixel centres lie at integer coordinates, as in the authors' released code."""
 
     fx: float
+    """Focal length along a row [px]."""
     fy: float
+    """Focal length along a column [px]."""
     cx: float
+    """Column of the principal point [px]."""
     cy: float
+    """Row of the principal point [px]."""
     width: int
+    """Columns of the image."""
     height: int
+    """Rows of the image."""
 
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "width", "height"):

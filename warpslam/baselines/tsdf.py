@@ -37,7 +37,7 @@ def import_open3d() -> Any:
     """The package open3d.
 
     Raises:
-        MissingDependencyError: it is not installed, or lacks a system library.
+        MissingDependencyError: It is not installed, or lacks a system library.
     """
     try:
         import open3d
@@ -135,8 +135,8 @@ class Tsdf(Baseline):
         short, and on its first call an image with holes.
 
         Raises:
-            InputError: the volume is empty, or the pose is no rigid transform.
-            MeshError: there is no surface.
+            InputError: The volume is empty, or the pose is no rigid transform.
+            MeshError: There is no surface.
         """
         T = check_transform(T_world_camera)
         if self.block_count == 0:

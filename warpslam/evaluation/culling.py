@@ -36,15 +36,13 @@ _MOST_TRIANGLES = 500_000
 
 @dataclass(frozen=True)
 class Views:
-    """Depth images of one camera.
-
-    poses: Camera-to-world transforms, shape (F, 4, 4); a view with an unknown (NaN) pose sees nothing.
-    depths: Depth images (H, W) [m], F of them, 0 = missing.
-    """
+    """Depth images of one camera."""
 
     poses: np.ndarray
+    """Camera-to-world transforms, shape (F, 4, 4); a view with an unknown (NaN) pose sees nothing."""
     intrinsics: Intrinsics
     depths: Sequence[np.ndarray]
+    """Depth images (H, W) [m], F of them, 0 = missing."""
 
 
 class Culling:

@@ -16,7 +16,6 @@ from warpslam.kernels.samples import Span
 from warpslam.runtime.launching import Step
 from warpslam.runtime.program import run_slices
 
-STAGES = ("coarse", "middle", "fine", "color")
 GROUP_SIZE = {"cpu": 8, "cuda": 16}
 """Samples of a ray between two looks at its transmittance."""
 

@@ -42,15 +42,16 @@ _NAMED = 3  # frames or files named in a message
 
 @dataclass(frozen=True)
 class Finding:
-    """check: What was looked at. severity: "error", "warning" or "ok". message: What is so, and where.
-
-    remedy: What to do or type; empty where nothing is wrong.
-    """
+    """What one check came to."""
 
     check: str
+    """What was looked at."""
     severity: str
+    """One of "error", "warning" and "ok"."""
     message: str
+    """What is so, and where."""
     remedy: str = ""
+    """What to do or type; empty where nothing is wrong."""
 
     def __str__(self) -> str:
         return f"{self.check}: {self.message}" + (f"; {self.remedy}" if self.remedy else "")
@@ -58,11 +59,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """folder: What was checked. name: Of the sequence; empty if it can't be opened. frames: How many it has."""
+    """All findings about one folder."""
 
     folder: str
+    """What was checked."""
     name: str = ""
+    """Of the sequence; empty if it can't be opened."""
     frames: int = 0
+    """How many it has."""
     findings: tuple[Finding, ...] = field(default_factory=tuple)
 
     @property

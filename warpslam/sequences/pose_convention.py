@@ -37,10 +37,12 @@ _POINT_COUNT = 5000
 
 @dataclass(frozen=True)
 class DepthView:
-    """depth: z-depth [m], (H, W), 0 = missing. pose: Matrix as stored, (4, 4)."""
+    """What one frame measured, and from where."""
 
     depth: np.ndarray
+    """z-depth [m], (H, W), 0 = missing."""
     pose: np.ndarray
+    """Matrix as stored, (4, 4)."""
 
 
 def moving_pairs(poses: np.ndarray, count: int) -> list[tuple[int, int]]:
