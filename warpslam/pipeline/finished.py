@@ -20,6 +20,7 @@ from warpslam.evaluation import (
 from warpslam.pipeline.results import render_panel
 from warpslam.pipeline.setup import load_slam, open_source
 from warpslam.runs.folder import RunFolder
+from warpslam.spread import spread
 from warpslam.storage.json_files import read_json
 from warpslam.storage.tum import associate, read_tum
 
@@ -87,7 +88,7 @@ def evaluate_run(
 def _rendering_metrics(folder: RunFolder, poses: np.ndarray, count: int, device: str | None) -> dict[str, Any]:
     slam, sequence = load_slam(folder, device), open_source(folder.read_source())
     indices = _frame_indices(folder, len(poses))
-    chosen = np.unique(np.linspace(0, len(poses) - 1, count).round().astype(int))
+    chosen = spread(len(poses), count)
     return rendering_metrics([render_panel(slam, sequence[indices[n]], poses[n]) for n in chosen])
 
 

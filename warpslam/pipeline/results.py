@@ -24,6 +24,8 @@ from warpslam.evaluation import (
 from warpslam.meshing import write_mesh
 from warpslam.report.plots import plot_error, plot_panels, plot_top_view
 from warpslam.runs.panels import Panel, save_panels
+from warpslam.spread import spread
+from warpslam.storage.atomic import PARTIAL
 from warpslam.storage.tum import write_tum
 
 if TYPE_CHECKING:
@@ -59,16 +61,14 @@ def trajectory_of(slam: Method, record: RunRecord) -> Trajectory:
 
 def write_trajectory(folder: RunFolder, trajectory: Trajectory, record: RunRecord) -> None:
     """Write the poses, and the true ones where there are any."""
-    partial = folder.trajectory.with_name("trajectory.tum.partial")
-    write_tum(partial, trajectory.timestamps, trajectory.poses)
-    partial.replace(folder.trajectory)
+    write_tum(folder.trajectory, trajectory.timestamps, trajectory.poses)
     if record.has_truth:
         write_tum(folder.ground_truth, trajectory.timestamps, record.truth)
 
 
 def remove_leftovers(folder: RunFolder) -> None:
     """Remove files that were not written in full; half a map may be what filled the disk."""
-    for leftover in folder.path.glob("*.part*"):
+    for leftover in folder.path.glob(f"*{PARTIAL}"):
         leftover.unlink(missing_ok=True)
 
 
@@ -163,7 +163,7 @@ def draw_panels(
 ) -> None:
     """Draw a few frames beside what the map renders from their poses, and note how alike they are."""
     usable = record.usable
-    positions = [usable[i] for i in np.unique(np.linspace(0, len(usable) - 1, PANEL_COUNT).round().astype(int))]
+    positions = [usable[i] for i in spread(len(usable), PANEL_COUNT)]
     # Small images tell as much in the figure, and rendering is slow without a GPU.
     stride = -(-sequence.intrinsics.width // PANEL_WIDTH)
     try:

@@ -156,8 +156,8 @@ def _look(center: np.ndarray, back: np.ndarray, up: np.ndarray, camera: Intrinsi
 
 
 def _project(points: np.ndarray, T_world_camera: np.ndarray, camera: Intrinsics) -> np.ndarray:
-    x, y, z = ((points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]).T
-    return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+    local = (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+    return np.stack(camera.project(*local.T), axis=1)
 
 
 def _render(mesh: trimesh.Trimesh, camera: Intrinsics, T_world_camera: np.ndarray, max_depth: float) -> np.ndarray:

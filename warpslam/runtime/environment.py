@@ -66,10 +66,10 @@ def free_gigabytes(device: wp.Device) -> float:
 
 def peak_memory_mib() -> float:
     """The most memory that this process has held [MiB]."""
-    # psutil knows the peak on Windows only.
-    try:
-        import resource
-    except ImportError:
+    # psutil knows the peak on Windows only, which is where the standard library does not.
+    if sys.platform == "win32":
         return float(psutil.Process().memory_info().peak_wset) / 2**20
+    import resource
+
     unit = 2**20 if sys.platform == "darwin" else 2**10
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
