@@ -8,6 +8,7 @@ import warp as wp
 
 from warpslam.baselines.imap_network import Bound, ImapBatch, ImapNetwork, Wanted, imap_shapes, unpack
 from warpslam.field.arrays import gradient_buffers
+from warpslam.field.objectives import choose_inliers, mapping_loss, tracking_loss
 from warpslam.kernels import imap_network as imap
 from warpslam.poses import vector_from_pose
 from warpslam.runtime.launching import Launcher
@@ -69,11 +70,11 @@ class Case:
             weight = EMPTY_WEIGHT if loss == "mapping" else 0.0
             batch.evaluate(self.network, self.bound, Wanted(True, gradient), tape, empty_weight=weight)
             if loss == "mapping":
-                batch.mapping_loss(COLOR_WEIGHT)
+                mapping_loss(batch, COLOR_WEIGHT)
                 batch.add_empty_loss(weight)
             else:
-                batch.choose_inliers(0.0)
-                batch.tracking_loss(0.5)
+                choose_inliers(batch, 0.0)
+                tracking_loss(batch, 0.5)
         tape.backward(batch.loss)
         result = {"loss": batch.loss.numpy()[0], "depth": batch.depth.numpy()[:RAYS], "rgb": batch.rgb.numpy()[:RAYS]}
         result["variance"] = batch.variance.numpy()[:RAYS]
@@ -195,7 +196,7 @@ def test_rays_that_are_not_kept_have_no_part():
         batch.bound_to(case.bound.low, case.bound.high)
         batch.keep.zero_()
         batch.evaluate(case.network, case.bound, Wanted(True, gradient), tape, empty_weight=EMPTY_WEIGHT)
-        batch.mapping_loss(COLOR_WEIGHT)
+        mapping_loss(batch, COLOR_WEIGHT)
         batch.add_empty_loss(EMPTY_WEIGHT)
     tape.backward(batch.loss)
     assert batch.loss.numpy()[0] == 0 and not batch.depth.numpy()[:RAYS].any()

@@ -11,9 +11,11 @@ import warp as wp
 from tests.reference import oracle
 from warpslam.field.arrays import FieldArrays, Gradients, GridGradient, gradient_buffers
 from warpslam.field.decoders import DecoderWeights
+from warpslam.field.objectives import choose_inliers, mapping_loss, tracking_loss
 from warpslam.field.packing import PackedDecoder
+from warpslam.field.passes import render
 from warpslam.field.ray_batch import RayBatch
-from warpslam.kernels import decoder
+from warpslam.kernels.decoder.layout import COLOR_WEIGHT_ROWS, E0, E3
 from warpslam.kernels.grid import Lattice, Vec32
 
 MAPPED_LEVELS = {
@@ -102,7 +104,7 @@ class Iteration:
 
     def render(self, gradients: Gradients | None = None, tape: wp.Tape | None = None) -> None:
         """Depth, colour and variance of the rays that are cast."""
-        self.batch.render(self.arrays, self.stage, gradients, tape)
+        render(self.batch, self.arrays, self.stage, gradients, tape)
 
     def mapping(self, *, filter_factor: float = 0.0) -> Gradient:
         """Mapping loss and the gradient of everything that the stage has one for; with a filter only rays with a depth
@@ -115,8 +117,8 @@ class Iteration:
             self.cast_and_sample()
             self.render(gradients, tape)
             if gradients.inliers_move:
-                self.batch.choose_inliers(filter_factor, normalized=False)
-            self.batch.mapping_loss(0.2 if self.stage == "color" else 0.0)
+                choose_inliers(self.batch, filter_factor, normalized=False)
+            mapping_loss(self.batch, 0.2 if self.stage == "color" else 0.0)
         tape.backward(self.batch.loss)
         rows = {level: gradient.buffers.numpy().sum(axis=0) for level, gradient in gradients.grids.items()}
         weights = {}
@@ -131,8 +133,8 @@ class Iteration:
         with self.batch.launcher.tape() as tape:
             self.cast_and_sample()
             self.render(Gradients(points=True), tape)
-            self.batch.choose_inliers(filter_factor, median_includes_missing=median_includes_missing)
-            self.batch.tracking_loss(0.5)
+            choose_inliers(self.batch, filter_factor, median_includes_missing=median_includes_missing)
+            tracking_loss(self.batch, 0.5)
         tape.backward(self.batch.loss)
         return Gradient(float(self.batch.loss.numpy()[0]), poses=self.poses.grad.numpy().copy())
 
@@ -151,12 +153,12 @@ class Iteration:
             )
             for level in levels
         }
-        weights = gradient_buffers(decoder.COLOR_WEIGHT_ROWS, self.device) if self.stage == "color" else None
+        weights = gradient_buffers(COLOR_WEIGHT_ROWS, self.device) if self.stage == "color" else None
         return Gradients(grids, points, weights)
 
     def _named_weight_gradient(self, rows: np.ndarray) -> dict[str, np.ndarray]:
         # Rows 93..95 of the embedding and of B pad it to 96: they must stay zero, so they may not get a gradient.
-        for first in (decoder.E0, decoder.E3):
+        for first in (E0, E3):
             assert not rows[first + 93 : first + 96].any()
         assert not rows[6:9, 29:].any()
         packed = self.arrays.decoders["color"]

@@ -11,7 +11,7 @@ from warpslam.camera import Intrinsics
 from warpslam.config import GridConfig, SamplingConfig
 from warpslam.field.decoder_files import load_decoders
 from warpslam.field.ray_batch import RayBatch
-from warpslam.kernels import rays
+from warpslam.kernels import pixels
 from warpslam.mapping.active_sampling import CELLS, LARGEST_ERROR, CellErrors
 from warpslam.poses import vector_from_pose
 from warpslam.runtime.launching import Launcher
@@ -105,7 +105,7 @@ def test_without_any_error_all_cells_are_alike(device):
     depth = wp.full(2 * CELL_COUNT, 1.0, dtype=float, device=device)
     keep = wp.full(2 * CELL_COUNT, 1, dtype=int, device=device)
     cumulative = wp.zeros((2, CELL_COUNT), dtype=float, device=device)
-    wp.launch(rays.accumulate_errors, 2, [CELL_COUNT, LARGEST_ERROR, keep, depth, depth], [cumulative], device=device)
+    wp.launch(pixels.accumulate_errors, 2, [CELL_COUNT, LARGEST_ERROR, keep, depth, depth], [cumulative], device=device)
     steps = np.diff(cumulative.numpy(), axis=1)
     np.testing.assert_allclose(steps, steps.mean(), rtol=1e-2)
     assert steps.min() > 0.0

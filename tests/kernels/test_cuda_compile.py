@@ -87,7 +87,7 @@ def tight() -> Path:
     """Cubin of a kernel that needs more registers than it may have, and of one that needs few."""
     module = "tests.tight_registers"
 
-    def many(x: wp.array(dtype=wp.types.vector(64, float))):
+    def many(x: wp.array[wp.types.vector(64, float)]):
         a = x[0]
         b = x[1]
         for n in range(100):
@@ -95,7 +95,7 @@ def tight() -> Path:
             b = wp.cw_mul(b, a) - x[n]
         x[0] = a + b
 
-    def few(x: wp.array(dtype=float)):
+    def few(x: wp.array[float]):
         x[0] = 1.0
 
     wp.get_module(module).options["enable_backward"] = False

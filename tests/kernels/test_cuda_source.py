@@ -5,14 +5,14 @@ import pytest
 import warp as wp
 
 from tests.kernels.iteration import Iteration, Rays
-from warpslam.kernels import decoder
+from warpslam.kernels.decoder import build
 
 
 @pytest.fixture(scope="module")
 def gradients(scene):
     """Mapping gradients of the colour stage by build, on the recorded scene."""
     result = {}
-    for name, kernels in (("cpu", decoder.CPU), ("cuda", decoder.CUDA)):
+    for name, kernels in (("cpu", build.CPU), ("cuda", build.CUDA)):
         rays = Rays.from_pixels(
             scene.pose[None], np.zeros(len(scene.depth), np.int32), scene.column, scene.row, scene.depth, scene.rgb
             , scene.fx, scene.fy, scene.cx, scene.cy

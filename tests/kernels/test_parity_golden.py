@@ -9,6 +9,7 @@ import warp as wp
 from tests.kernels.iteration import Iteration, Rays, field_on_device, relative_error
 from tests.reference.oracle import STAGES
 from warpslam.camera import Intrinsics
+from warpslam.field.passes import query
 from warpslam.field.ray_batch import RayBatch
 from warpslam.kernels import adam
 from warpslam.mapping.frustum import select_in_frustum
@@ -29,7 +30,7 @@ def test_field_at_points(scene, device, stage):
     """Logit and colour at points agree within 1e-4 of the largest value, clamped lookups beyond the border included."""
     batch = RayBatch(len(scene.points), 1, device)
     batch.set_points(scene.points)
-    batch.query(field_on_device(scene.field(), device), stage)
+    query(batch, field_on_device(scene.field(), device), stage)
     expected = scene.point_values[stage]
     inside = ((scene.points > scene.lo) & (scene.points < scene.hi)).all(axis=1)
     assert relative_error(batch.logit.numpy()[inside], expected[inside, 3]) < 1e-4

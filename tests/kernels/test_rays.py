@@ -9,6 +9,8 @@ from warpslam.camera import Intrinsics
 from warpslam.config import GridConfig
 from warpslam.field.arrays import Gradients, GridGradient, Thresholds, gradient_buffers
 from warpslam.field.decoder_files import load_decoders
+from warpslam.field.objectives import mapping_loss
+from warpslam.field.passes import render as render_batch
 from warpslam.field.ray_batch import RayBatch
 from warpslam.poses import vector_from_pose
 from warpslam.scene.image_pool import ImagePool
@@ -102,8 +104,8 @@ def render(batch: RayBatch, scene_map: SceneMap, *thresholds: float):
         array.zero_()
     with batch.launcher.tape() as tape:
         gradients = Gradients({"color": grid}, points=True)
-        batch.render(arrays, "color", gradients, tape, thresholds=Thresholds(*thresholds))
-        batch.mapping_loss(0.2)
+        render_batch(batch, arrays, "color", gradients, tape, thresholds=Thresholds(*thresholds))
+        mapping_loss(batch, 0.2)
     tape.backward(batch.loss)
     parts = batch.rgb, batch.depth, batch.direction.grad
     return *(part.numpy().copy() for part in parts), grid.buffers.numpy().sum(axis=0)
@@ -151,4 +153,4 @@ def test_gradients_without_a_tape_are_refused(images, device, scene_map):
     """An adjoint that nobody records would be a silent zero."""
     batch = draw(images, device, scene_map, jitter=False)
     with pytest.raises(ValueError, match="tape"):
-        batch.render(scene_map.arrays(), "color", Gradients(points=True))
+        render_batch(batch, scene_map.arrays(), "color", Gradients(points=True))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections import Counter, namedtuple
 
 import numpy as np
@@ -16,8 +15,10 @@ from tests.test_slam import CAMERA, new_slam
 from warpslam import cli
 from warpslam.camera import Intrinsics
 from warpslam.errors import WarpSlamError
+from warpslam.field import passes
 from warpslam.field.arrays import Gradients, Thresholds
-from warpslam.kernels.decoder import decoders_for
+from warpslam.field.passes import render
+from warpslam.kernels.decoder.build import decoders_for
 from warpslam.profiling import costs, recorder
 from warpslam.runtime import launching, phases, program
 from warpslam.runtime.phases import phase
@@ -33,8 +34,8 @@ KERNELS = {
     "list_weighty", "list_steep", "composite_backward", "collect_ray_gradients", "mapping_loss",
     "mapping_loss (adjoint)", "tracking_loss",
     "tracking_loss (adjoint)", "cast_rays (adjoint)", "tracking_residuals", "choose_inliers", "lower_median",
-    "adam_rows", "adam_poses", "advance_step", "note_pose", "transpose_color_weights", "_classify_kernel",
-    "_facing_kernel",
+    "adam_rows", "adam_poses", "advance_step", "note_pose", "transpose_color_weights", "classify_points",
+    "find_facing",
 }  # fmt: skip
 HOOKED = (
     (warp_context, "invoke"), (wp, "launch"), (wp.Launch, "launch"), (wp.Module, "load"), (program, "_pool"),
@@ -64,7 +65,7 @@ def run(frames):
     """A run with two slices on any machine, profiled from the first frame to the mesh."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(recorder, "matrix_peak_gflops", lambda: 100.0)
-        patch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
+        patch.setattr("psutil.Process.cpu_affinity", lambda self: [0, 1], raising=False)
         slam = new_slam(*SETTINGS)
         with warpslam.profile() as profile:
             timings = [result.timings for result in steps(slam, frames)]
@@ -231,7 +232,7 @@ def test_counted_points_are_those_computed(frames, min_transmittance, monkeypatc
     for bits in {id(array): array for array in batch.bits.values()}.values():
         bits.fill_(0xFFFFFFFF)
     with warpslam.profile() as profile:
-        batch.render(arrays, "color", thresholds=thresholds)
+        render(batch, arrays, "color", thresholds=thresholds)
     counted = Counter()
     for launch in profile.launches:
         assert launch.work.counted or not launch.kernel.endswith("_forward")
@@ -249,8 +250,8 @@ def test_counted_points_are_those_computed(frames, min_transmittance, monkeypatc
     batch.logit_grad.assign(gradient)
     batch.point_grad.zero_()
     batch.steep_count.zero_()
-    batch.launcher.launch(*batch._steep(0, batch.count, 0, 0.25))
-    step = batch._geometry_adjoint(arrays, "middle", Gradients(points=True), 0, batch.count, 0, batch.point_grad)
+    batch.launcher.launch(*passes.steep_samples(batch, 0, batch.count, 0, 0.25))
+    step = passes.geometry_adjoint(batch, arrays, "middle", Gradients(points=True), 0, batch.count, 0, batch.point_grad)
     with warpslam.profile() as profile:
         batch.launcher.launch(*step)
     (launch,) = profile.launches

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from pathlib import Path
 
@@ -72,7 +71,7 @@ def test_compiles_once_and_says_so(empty_cache):
 
 def test_modules_load_side_by_side(monkeypatch):
     """With two cores two modules are in work at once, reports come one at a time and count up to the total."""
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1}, raising=False)
+    monkeypatch.setattr(compilation, "process_cores", lambda: [0, 1])
     together = threading.Barrier(2, timeout=20)
     names, seen, inside = ["warpslam.kernels.losses", "warpslam.kernels.adam"], [], []
     monkeypatch.setattr(compilation, "module_names", lambda target: names)
@@ -96,8 +95,8 @@ def test_an_error_of_a_module_comes_through(monkeypatch):
         raise RuntimeError(f"no {modules[0].name}")
 
     monkeypatch.setattr(wp, "force_load", fail)
-    for cores in ({0}, {0, 1}):
-        monkeypatch.setattr(os, "sched_getaffinity", lambda pid, cores=cores: cores, raising=False)
+    for cores in ([0], [0, 1]):
+        monkeypatch.setattr(compilation, "process_cores", lambda cores=cores: cores)
         with pytest.raises(RuntimeError, match="no warpslam"):
             compile_kernels(CPU)
 

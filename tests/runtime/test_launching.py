@@ -1,6 +1,5 @@
 """Launchers on two threads at a time: their tapes stay apart, and their slices share workers without a deadlock."""
 
-import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -20,7 +19,7 @@ WAIT = 60.0  # [s]; a test that hangs fails instead
 @pytest.fixture
 def two_slices(monkeypatch):
     """As on a machine of two cores, whatever this one has."""
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    monkeypatch.setattr("psutil.Process.cpu_affinity", lambda self: [0, 1], raising=False)
 
 
 def gradients(iteration: Iteration, kind: str) -> list[np.ndarray]:
@@ -54,7 +53,7 @@ def test_gradients_of_two_threads_equal_those_of_one(two_slices):
 
 
 @wp.kernel
-def square(x: wp.array(dtype=float), factor: float, y: wp.array(dtype=float)):
+def square(x: wp.array[float], factor: float, y: wp.array[float]):
     tid = wp.tid()
     wp.atomic_add(y, 0, factor * x[tid] * x[tid])
 

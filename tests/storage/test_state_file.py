@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.numpy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -55,6 +56,15 @@ def test_comes_back_as_it_was(content, tmp_path):
     assert_content(path)
     assert path.read_bytes() == content
     assert [file.name for file in path.parent.iterdir()] == ["b.safetensors"]
+
+
+def test_safetensors_reads_the_same(content):
+    """The published package finds every array, and the metadata are text."""
+    arrays = safetensors.numpy.load(content)
+    assert arrays.keys() == ARRAYS.keys()
+    for name, array in ARRAYS.items():
+        assert arrays[name].dtype == array.dtype and arrays[name].shape == array.shape, name
+        np.testing.assert_array_equal(arrays[name], array)
 
 
 def test_layout_is_that_of_safetensors(content):

@@ -22,8 +22,10 @@ import warp as wp
 import warpslam
 from tools.benchmarks.iterations import CAMERA, SPACING, Ours
 from warpslam.field.arrays import Gradients, GridGradient, gradient_buffers
+from warpslam.field.objectives import mapping_loss
+from warpslam.field.passes import render
 from warpslam.field.ray_batch import RayBatch
-from warpslam.kernels.decoder import COLOR_WEIGHT_ROWS
+from warpslam.kernels.decoder.layout import COLOR_WEIGHT_ROWS
 from warpslam.poses import vector_from_pose
 from warpslam.runtime.launching import Launcher
 from warpslam.synthetic import SyntheticSequence
@@ -86,8 +88,8 @@ def iterate(ours: Ours, gradients: Gradients, count: int) -> None:
             batch.cast(poses, differentiate=gradients.points)
             batch.bound(arrays)
             batch.place_samples(sampling.stratified, sampling.surface, jitter=True)
-            batch.render(arrays, "color", gradients, tape)
-            batch.mapping_loss(0.2)
+            render(batch, arrays, "color", gradients, tape)
+            mapping_loss(batch, 0.2)
         launcher.call(partial(tape.backward, batch.loss))
 
 

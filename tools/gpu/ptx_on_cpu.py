@@ -299,7 +299,7 @@ def install(**options: bool) -> Runner:
     """
     import warp as wp
 
-    from warpslam.field import ray_batch
+    from warpslam.field import passes, ray_batch
     from warpslam.runtime import cores, program
 
     runner, original = Runner(**options), wp.launch
@@ -332,7 +332,7 @@ def install(**options: bool) -> Runner:
     _replace(cores.slice_count, lambda device: 1)
     kernels_of = ray_batch.decoders_for
     _replace(kernels_of, lambda device: kernels_of(SimpleNamespace(is_cuda=True)))
-    ray_batch.GROUP_SIZE["cpu"] = ray_batch.GROUP_SIZE["cuda"]
+    passes.GROUP_SIZE["cpu"] = passes.GROUP_SIZE["cuda"]
     return runner
 
 

@@ -26,10 +26,11 @@ from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.errors import InputError
 from warpslam.field.complexity import flops_per_point, weight_count
+from warpslam.field.objectives import choose_inliers, mapping_loss, tracking_loss
 from warpslam.field.rendering import RenderedImage
 from warpslam.field.seeds import ray_seed
 from warpslam.frames import AdmittedFrame, FrameResult
-from warpslam.kernels import adam, losses, rays
+from warpslam.kernels import adam, losses, pixels
 from warpslam.kernels import imap_density as density
 from warpslam.kernels import imap_network as imap
 from warpslam.meshing import extract_mesh
@@ -195,8 +196,8 @@ class Imap(Baseline):
         batch.cast(self._poses.poses, differentiate=tape is not None)
         batch.bound_to(bound.low, bound.high)
         batch.evaluate(self.network, bound, wanted, tape, jitter=self.config.sampling.jitter)
-        batch.choose_inliers(0.0)
-        batch.tracking_loss(TRACKING_COLOR_WEIGHT)
+        choose_inliers(batch, 0.0)
+        tracking_loss(batch, TRACKING_COLOR_WEIGHT)
 
     def _map(self, index: int, depth: np.ndarray, first: bool) -> float:
         """Train on the frame and on keyframes; the mean loss a ray of the last iteration."""
@@ -223,7 +224,7 @@ class Imap(Baseline):
                 batch.bound_to(bound.low, bound.high)
                 jitter, weight = self.config.sampling.jitter, settings.empty_weight
                 batch.evaluate(self.network, bound, wanted, tape, jitter=jitter, empty_weight=weight)
-                batch.mapping_loss(settings.color_weight)
+                mapping_loss(batch, settings.color_weight)
                 batch.add_empty_loss(settings.empty_weight)
             self._launcher.call(partial(tape.backward, batch.loss))
             self._optimizer.update(self.network.weights, rate)
@@ -377,7 +378,7 @@ class Imap(Baseline):
 def _compile(device: wp.Device) -> float:
     """Load the kernel modules that this method needs, and none of NICE-SLAM's decoders; the seconds it took."""
     start = time.perf_counter()
-    names = [module.__name__ for module in (adam, density, losses, rays)]
-    for name in [*names, f"warpslam.imap_{'cuda' if device.is_cuda else 'cpu'}"]:
+    names = [module.__name__ for module in (adam, density, losses)]
+    for name in [*names, pixels.MODULE, f"warpslam.imap_{'cuda' if device.is_cuda else 'cpu'}"]:
         wp.get_module(name).load(device)
     return time.perf_counter() - start

@@ -8,13 +8,16 @@ from functools import partial
 import numpy as np
 import warp as wp
 
+from warpslam.field.arrays import struct
 from warpslam.field.complexity import imap_shapes
 from warpslam.field.decoders import EMBEDDING_SCALE
 from warpslam.field.ray_batch import RayBatch
 from warpslam.kernels import imap_density as density
 from warpslam.kernels import imap_network as imap
 from warpslam.kernels import rays
+from warpslam.kernels.compositing import Box
 from warpslam.kernels.grid import Vec32
+from warpslam.kernels.samples import Span
 from warpslam.runtime.launching import Launcher, Step
 from warpslam.runtime.program import run_slices
 
@@ -144,6 +147,18 @@ class ImapBatch(RayBatch):
         """Density of every sample, before the ReLU."""
         return self.logit
 
+    @property
+    def composited(self) -> density.Composited:
+        """The samples as compositing takes them."""
+        return struct(
+            density.Composited,
+            order=self.order,
+            density=self.density,
+            color=self.color,
+            weight=self.weight,
+            transmittance=self.in_front,
+        )
+
     def evaluate(
         self,
         network: ImapNetwork,
@@ -161,23 +176,23 @@ class ImapBatch(RayBatch):
         empty_weight: Of |density| at the empty samples, whose adjoint is that of the sum over rays.
         """
         samples = self.sample_count
-        corners = [bound.low, bound.high, self.origin, self.direction]
+        corners = [struct(Box, low=bound.low, high=bound.high), self.rays]
 
         def steps(first: int, stop: int, slot: int) -> list[Step]:
             ray_count = stop - first
-            inputs = [first, self.seeds, self.iteration, int(jitter), self.stratified, samples, int(use_depth)]
-            inputs += [self.measured_depth, self.t_exit, self.max_depth, self.z]
+            inputs = [first, self.draws, int(jitter), self.stratified, int(use_depth)]
+            inputs += [self.measured_depth, self.t_exit, self.max_depth, self.rays]
             result: list[Step] = [(density.place_stratified, ray_count, inputs)]
             if self.empty:
-                inputs = [first, self.seeds, self.iteration, self.visible, self.empty, samples]
-                result.append((density.place_empty, ray_count, [*inputs, self.measured_depth, self.z]))
+                inputs = [first, self.draws, self.visible, self.empty, self.measured_depth, self.rays]
+                result.append((density.place_empty, ray_count, inputs))
             result += self._forward(network, first, stop, 0, self.stratified)
-            inputs = [first, self.stratified, self.importance, samples, self.keep, *corners]
-            inputs += [self.density, self.weight, self.z, self.order]
+            inputs = [first, self.stratified, self.importance, self.keep, *corners]
+            inputs += [self.density, self.weight, self.order]
             result.append((density.place_importance, ray_count, inputs))
             result += self._forward(network, first, stop, self.stratified, samples - self.stratified)
-            inputs = [first, self.visible, samples, self.keep, *corners, self.z, self.order, self.density, self.color]
-            inputs += [self.weight, self.in_front, self.depth, self.variance, self.rgb]
+            inputs = [first, self.visible, self.keep, *corners, self.composited]
+            inputs += [self.depth, self.variance, self.rgb]
             result.append((density.composite, ray_count, inputs))
             return result
 
@@ -200,14 +215,15 @@ class ImapBatch(RayBatch):
     def _forward(self, network: ImapNetwork, first: int, stop: int, sample: int, width: int) -> list[Step]:
         """Density and colour of some samples of the rays ``first`` to ``stop``."""
         kernels, W, count = self.kernels_imap, network.weights, (stop - first) * width
-        place = [first, sample, width, self.sample_count]
-        result: list[Step] = [(kernels.embed, count, [*place, self.origin, self.direction, self.z, W, self.embedding])]
+        span = struct(Span, point_count=count, first_ray=first, first_sample=sample, width=width)
+        result: list[Step] = [(kernels.embed, count, [span, self.rays, W, self.embedding])]
         x = self.embedding
         for k, y in enumerate(self.layers):
-            inputs = [count, *place, 32, _IN_BLOCKS[k], W, imap.LAYER[k], W, imap.BIAS + 8 * k, x, imap.FORWARD, x, y]
+            layer = _layer(_IN_BLOCKS[k], W, imap.LAYER[k], W, imap.BIAS + 8 * k)
+            inputs = [span, self.sample_count, layer, x, imap.FORWARD, x, y]
             result.append((kernels.product, (imap.BLOCKS, -(-count // 4)), inputs))
             x = y
-        result.append((kernels.output, count, [*place, W, x, self.color, self.density]))
+        result.append((kernels.output, count, [span, self.sample_count, W, x, self.color, self.density]))
         return result
 
     def _backward(
@@ -216,39 +232,51 @@ class ImapBatch(RayBatch):
         kernels, samples, W, T = self.kernels_imap, self.sample_count, network.weights, network.transposed
         start, end = first * samples, stop * samples
         count, chunks = end - start, -(-(end - start) // _CHUNK)
-        points = [self.origin, self.direction, self.z]
-        span = [start, end, _CHUNK, slot]
-        inputs = [first, self.visible, samples, self.keep, bound.low, bound.high, *points, self.order, self.density]
-        inputs += [self.color, self.weight, self.in_front, self.depth.grad, self.rgb.grad, empty_weight]
-        result: list[Step] = [(density.composite_backward, stop - first, [*inputs, self.logit_grad, self.color_grad])]
+        span = struct(Span, point_count=count, first_ray=first, first_sample=0, width=samples)
+        parts = struct(imap.Chunks, start=start, stop=end, size=_CHUNK, slot=slot)
+        gradient = struct(
+            density.CompositeGradient,
+            depth_grad=self.depth.grad,
+            rgb_grad=self.rgb.grad,
+            density_grad=self.logit_grad,
+            color_grad=self.color_grad,
+        )
+        inputs = [first, self.visible, self.keep, struct(Box, low=bound.low, high=bound.high), self.rays]
+        inputs += [self.composited, empty_weight, gradient]
+        result: list[Step] = [(density.composite_backward, stop - first, inputs)]
         d, other = self._d
         inputs = [start, W, self.layers[-1], self.color_grad, self.logit_grad, d]
         result.append((kernels.output_backward, count, inputs))
         if wanted.weights is not None:
-            inputs = [*span, self.layers[-1], self.color_grad, self.logit_grad, wanted.weights]
+            inputs = [parts, self.layers[-1], self.color_grad, self.logit_grad, wanted.weights]
             result.append((kernels.output_weights, (chunks, imap.BLOCKS), inputs))
         for k in reversed(range(imap.LAYERS)):
             x = self.layers[k - 1] if k else self.embedding
             blocks = _IN_BLOCKS[k]
             if wanted.weights is not None:
-                inputs = [*span, blocks, imap.LAYER[k], _channels(x), d, wanted.weights]
+                inputs = [parts, blocks, imap.LAYER[k], _channels(x), d, wanted.weights]
                 result.append((kernels.layer_weights, (chunks, imap.BLOCKS, 4 * blocks), inputs))
-                inputs = [*span, imap.BIAS + 8 * k, d, wanted.weights]
+                inputs = [parts, imap.BIAS + 8 * k, d, wanted.weights]
                 result.append((kernels.bias_weights, (chunks, imap.BLOCKS), inputs))
             target, mode = (other, imap.ADJOINT) if k else (self._d_embedding, imap.UNMASKED)
-            inputs = [count, first, 0, samples, samples, 32, imap.BLOCKS, T, imap.LAYER_T[k], W, 0, d, mode, x, target]
+            layer = _layer(imap.BLOCKS, T, imap.LAYER_T[k], W, 0)
+            inputs = [span, samples, layer, d, mode, x, target]
             result.append((kernels.product, (blocks, -(-count // 4)), inputs))
             d, other = target, d
-        inputs = [start, samples, *points, W, self._d_embedding, int(wanted.points), self.point_grad]
+        inputs = [start, self.rays, W, self._d_embedding, int(wanted.points), self.point_grad]
         result.append((kernels.embed_backward, count, inputs))
         if wanted.weights is not None:
-            inputs = [*span, samples, *points, self._d_embedding, wanted.weights]
+            inputs = [parts, self.rays, self._d_embedding, wanted.weights]
             result.append((kernels.embedding_weights, (chunks, imap.EMBEDDING_BLOCKS), inputs))
         if wanted.points:
-            inputs = [first, samples, self.keep, self.keep, self.z, self.point_grad]
+            inputs = [first, self.rays, self.keep, self.keep, self.point_grad]
             inputs += [self.origin.grad, self.direction.grad]
             result.append((rays.collect_ray_gradients, stop - first, inputs))
         return result
+
+
+def _layer(in_blocks: int, W: wp.array, row: int, bias: wp.array, bias_row: int) -> imap.Layer:
+    return struct(imap.Layer, trips=32, in_blocks=in_blocks, W=W, row=row, bias=bias, bias_row=bias_row)
 
 
 def _channels(x: wp.array) -> wp.array:

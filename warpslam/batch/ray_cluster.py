@@ -26,6 +26,7 @@ from warpslam.batch.status import (
     initial_status,
 )
 from warpslam.errors import ConfigError, MissingDependencyError
+from warpslam.runtime.cores import process_cores
 
 RETRIES = 3
 """How often a sequence is started again after its worker was lost."""
@@ -81,8 +82,7 @@ def run_on_ray(
 def _connect(ray: Any, address: str) -> None:
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "warning"}
     if address == "local":
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        options |= {"address": "local", "num_cpus": cores, "include_dashboard": False}
+        options |= {"address": "local", "num_cpus": len(process_cores()), "include_dashboard": False}
     else:
         options["address"] = address
     try:

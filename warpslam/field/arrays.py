@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.field.packing import PackedDecoder
-from warpslam.kernels.grid import Lattice, Vec32
+from warpslam.kernels.compositing import Box
+from warpslam.kernels.grid import Lattice, Level, Vec32
+from warpslam.kernels.pixels import Camera
 from warpslam.runtime.cores import slice_count
 
 
@@ -48,6 +51,15 @@ class FieldArrays:
     high: wp.vec3
     seen: wp.array | None = None
 
+    @property
+    def bound(self) -> Box:
+        """The map's bound as the kernels take it."""
+        return struct(Box, low=self.low, high=self.high)
+
+    def level(self, name: str) -> Level:
+        """A grid as the kernels take it."""
+        return struct(Level, lattice=self.lattices[name], features=self.features[name])
+
 
 @dataclass
 class GridGradient:
@@ -64,7 +76,7 @@ class Gradients:
     grids: by level.
     points: sample positions, and through them rays and poses.
     color_weights: (slices, rows) buffers of `Vec32` for the colour decoder, or None.
-    inliers_move: only those rays reach the poses that `RayBatch.choose_inliers` chooses after the rendering.
+    inliers_move: only those rays reach the poses that `field.objectives.choose_inliers` chooses after the rendering.
     """
 
     grids: dict[str, GridGradient] = field(default_factory=dict)
@@ -78,13 +90,21 @@ def gradient_buffers(row_count: int, device: wp.Device) -> wp.array:
     return wp.zeros((slice_count(device), row_count), dtype=Vec32, device=device)
 
 
-def camera_vectors(camera: Intrinsics) -> list[wp.vec2]:
+def struct(kind: Any, **fields: Any) -> Any:
+    """A `wp.struct` with these fields. It holds the arrays as they are now: one that is reallocated needs a new one."""
+    result = kind()
+    for name, value in fields.items():
+        setattr(result, name, value)
+    return result
+
+
+def camera_struct(camera: Intrinsics) -> Camera:
     """Focal lengths and principal point [px], as the kernels take them."""
-    return [wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)]
+    return struct(Camera, focal=wp.vec2(camera.fx, camera.fy), center=wp.vec2(camera.cx, camera.cy))
 
 
-def projection(camera: Intrinsics, T_world_camera: np.ndarray) -> list[wp.mat44 | wp.vec2]:
+def projection(camera: Intrinsics, T_world_camera: np.ndarray) -> list[wp.mat44 | Camera]:
     """What brings world points into an image, as the kernels take it: T_camera_world of a pose (4, 4), and
-    `camera_vectors`.
+    `camera_struct`.
     """
-    return [wp.mat44(np.linalg.inv(T_world_camera).astype(np.float32)), *camera_vectors(camera)]
+    return [wp.mat44(np.linalg.inv(T_world_camera).astype(np.float32)), camera_struct(camera)]

@@ -10,6 +10,7 @@ import warp as wp
 from warpslam.camera import Intrinsics
 from warpslam.config import SamplingConfig
 from warpslam.field.arrays import FieldArrays
+from warpslam.field.passes import render, take_surface_depth
 from warpslam.field.ray_batch import RayBatch
 from warpslam.poses import vector_from_pose
 from warpslam.runtime.phases import phase
@@ -82,10 +83,10 @@ def _render(
             batch.measured_depth[: batch.count].assign(depth[first : first + count].reshape(-1))
         batch.bound(arrays, use_depth=guided)
         batch.place_samples(stratified, sampling.surface, use_depth=guided)
-        batch.render(arrays, "color" if guided else "fine")
+        render(batch, arrays, "color" if guided else "fine")
         if not guided:
             # A mean between two surfaces would send the second pass's samples to where nothing is.
-            batch.take_surface_depth(FIRST_PASS_OCCUPANCY)
+            take_surface_depth(batch, FIRST_PASS_OCCUPANCY)
         for image, array in ((out.depth, batch.depth), (out.rgb, batch.rgb), (out.variance, batch.variance)):
             image[first : first + count] = array.numpy()[: batch.count].reshape(count, width, *image.shape[2:])
     np.clip(out.rgb, 0.0, 1.0, out=out.rgb)

@@ -21,21 +21,21 @@ def adam_scale(step: int) -> wp.vec2:
 
 
 @wp.kernel(enable_backward=False)
-def advance_step(step: wp.array(dtype=int)):
+def advance_step(step: wp.array[int]):
     step[0] = step[0] + 1
 
 
 @wp.kernel(enable_backward=False)
 def adam_rows(
     start: int,
-    rows: wp.array(dtype=int),
-    step: wp.array(dtype=int),
+    rows: wp.array[int],
+    step: wp.array[int],
     learning_rate: float,
-    x: wp.array(dtype=Vec32),
-    grad: wp.array2d(dtype=Vec32),
-    m: wp.array(dtype=Vec32),
-    v: wp.array(dtype=Vec32),
-    rejected: wp.array(dtype=int),
+    x: wp.array[Vec32],
+    grad: wp.array2d[Vec32],
+    m: wp.array[Vec32],
+    v: wp.array[Vec32],
+    rejected: wp.array[int],
 ):
     row = rows[start + wp.tid()]
     g = grad[0, row]
@@ -62,7 +62,7 @@ def adam_rows(
 
 
 @wp.kernel(enable_backward=False)
-def clear_moments(rows: wp.array(dtype=int), m: wp.array(dtype=Vec32), v: wp.array(dtype=Vec32)):
+def clear_moments(rows: wp.array[int], m: wp.array[Vec32], v: wp.array[Vec32]):
     row = rows[wp.tid()]
     m[row] = Vec32()
     v[row] = Vec32()
@@ -70,13 +70,13 @@ def clear_moments(rows: wp.array(dtype=int), m: wp.array(dtype=Vec32), v: wp.arr
 
 @wp.kernel(enable_backward=False)
 def adam_poses(
-    step: wp.array(dtype=int),
-    rates: wp.array(dtype=wp.vec2),
+    step: wp.array[int],
+    rates: wp.array[wp.vec2],
     first: int,
-    x: wp.array(dtype=float, ndim=2),
-    grad: wp.array(dtype=float, ndim=2),
-    m: wp.array(dtype=float, ndim=2),
-    v: wp.array(dtype=float, ndim=2),
+    x: wp.array2d[float],
+    grad: wp.array2d[float],
+    m: wp.array2d[float],
+    v: wp.array2d[float],
 ):
     """Pose vectors (qw, qx, qy, qz, tx, ty, tz); rows below ``first`` stay fixed. Clears the gradient.
 
@@ -96,9 +96,7 @@ def adam_poses(
 
 
 @wp.kernel(enable_backward=False)
-def note_pose(
-    iteration: wp.array(dtype=int), poses: wp.array(dtype=float, ndim=2), visited: wp.array(dtype=float, ndim=2)
-):
+def note_pose(iteration: wp.array[int], poses: wp.array2d[float], visited: wp.array2d[float]):
     """Keep the first pose vector of an iteration."""
     k = wp.tid()
     visited[iteration[0], k] = poses[0, k]

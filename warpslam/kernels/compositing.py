@@ -15,15 +15,43 @@ they count as outside with w = 0. What is left out weighs less than min_transmit
 than min_transmittance * z_max, and rgb by less than min_transmittance * the brightest colour.
 Per-sample arrays have shape (ray_count * sample_count,). Rays that are not kept render 0 and have no gradient.
 
-The samples that need colour, and those whose logit has a gradient, are listed: a launch over the rays from ``start`` on
-fills ``listed`` from ``start * sample_count`` on, and the entry of ``listed_count`` that `count_index` gives its slot.
+The samples that need colour, and those whose logit has a gradient, are listed: see `Listed`.
 """
 
 import warp as wp
 
+from warpslam.kernels.samples import Rays
+
 OUTSIDE_LOGIT = wp.constant(100.0)
 # Slices run side by side: each has a cache line of its own.
 COUNT_STRIDE = wp.constant(16)
+
+
+@wp.struct
+class Box:
+    """Two opposite corners [m]."""
+
+    low: wp.vec3
+    high: wp.vec3
+
+
+@wp.struct
+class Rendered:
+    """What the field says of each sample, and what it weighs on its ray."""
+
+    logit: wp.array[float]
+    color: wp.array[wp.vec3]
+    weight: wp.array[float]
+
+
+@wp.struct
+class Listed:
+    """Samples on a list. A slice's part begins at ``start``, and its length is entry `count_index` (slot) of counts."""
+
+    start: int
+    slot: int
+    samples: wp.array[int]
+    counts: wp.array[int]
 
 
 @wp.func
@@ -38,6 +66,12 @@ def count_index(slot: int) -> int:
 
 
 @wp.func
+def listed_count(listed: Listed) -> int:
+    """Samples on a slice's part of a list."""
+    return listed.counts[count_index(listed.slot)]
+
+
+@wp.func
 def occupancy(logit: float) -> float:
     return 1.0 / (1.0 + wp.exp(-10.0 * logit))
 
@@ -45,18 +79,17 @@ def occupancy(logit: float) -> float:
 @wp.kernel(enable_backward=False)
 def start_rays(
     start: int,
-    slot: int,
-    listed_count: wp.array(dtype=int),
-    keep: wp.array(dtype=int),
-    transmittance: wp.array(dtype=float),
-    depth: wp.array(dtype=float),
-    variance: wp.array(dtype=float),
-    rgb: wp.array(dtype=wp.vec3),
+    listed: Listed,
+    keep: wp.array[int],
+    transmittance: wp.array[float],
+    depth: wp.array[float],
+    variance: wp.array[float],
+    rgb: wp.array[wp.vec3],
 ):
     """Nothing absorbed yet, nothing listed; a transmittance of -1 marks rays that are not kept."""
     tid = start + wp.tid()
     if wp.tid() == 0:
-        listed_count[count_index(slot)] = 0
+        listed.counts[count_index(listed.slot)] = 0
     transmittance[tid] = wp.where(keep[tid] != 0, 1.0, -1.0)
     depth[tid] = 0.0
     variance[tid] = 0.0
@@ -68,39 +101,34 @@ def composite(
     start: int,
     first_sample: int,
     width: int,
-    sample_count: int,
     min_transmittance: float,
-    low: wp.vec3,
-    high: wp.vec3,
-    ray_origin: wp.array(dtype=wp.vec3),
-    ray_direction: wp.array(dtype=wp.vec3),
-    z: wp.array(dtype=float),
-    logit: wp.array(dtype=float),
-    weight: wp.array(dtype=float),
-    transmittance: wp.array(dtype=float),
-    depth: wp.array(dtype=float),
+    bound: Box,
+    rays: Rays,
+    rendered: Rendered,
+    transmittance: wp.array[float],
+    depth: wp.array[float],
 ):
     """Weights of the next samples of each ray, whose transmittance and depth so far are carried along."""
     tid = start + wp.tid()
     passed = transmittance[tid]
     if passed < 0.0:
         return
-    first = tid * sample_count + first_sample
+    first = tid * rays.sample_count + first_sample
     if passed < min_transmittance:
         for n in range(width):
-            logit[first + n] = OUTSIDE_LOGIT
-            weight[first + n] = 0.0
+            rendered.logit[first + n] = OUTSIDE_LOGIT
+            rendered.weight[first + n] = 0.0
         return
     d = depth[tid]
     for n in range(width):
         i = first + n
-        if not is_inside(ray_origin[tid] + z[i] * ray_direction[tid], low, high):
-            logit[i] = OUTSIDE_LOGIT
-        alpha = occupancy(logit[i])
+        if not is_inside(rays.origin[tid] + rays.z[i] * rays.direction[tid], bound.low, bound.high):
+            rendered.logit[i] = OUTSIDE_LOGIT
+        alpha = occupancy(rendered.logit[i])
         w = alpha * passed
         passed *= 1.0 - alpha + 1.0e-10
-        weight[i] = w
-        d += w * z[i]
+        rendered.weight[i] = w
+        d += w * rays.z[i]
     transmittance[tid] = passed
     depth[tid] = d
 
@@ -108,34 +136,31 @@ def composite(
 @wp.kernel(enable_backward=False)
 def ray_variance(
     start: int,
-    sample_count: int,
-    z: wp.array(dtype=float),
-    keep: wp.array(dtype=int),
-    weight: wp.array(dtype=float),
-    depth: wp.array(dtype=float),
-    variance: wp.array(dtype=float),
+    rays: Rays,
+    keep: wp.array[int],
+    weight: wp.array[float],
+    depth: wp.array[float],
+    variance: wp.array[float],
 ):
     tid = start + wp.tid()
     if keep[tid] == 0:
         return
     v = float(0.0)
-    for n in range(sample_count):
-        e = z[tid * sample_count + n] - depth[tid]
-        v += weight[tid * sample_count + n] * e * e
+    for n in range(rays.sample_count):
+        e = rays.z[tid * rays.sample_count + n] - depth[tid]
+        v += weight[tid * rays.sample_count + n] * e * e
     variance[tid] = v
 
 
 @wp.kernel(enable_backward=False)
 def list_weighty(
     start: int,
-    slot: int,
+    listed: Listed,
     sample_count: int,
-    keep: wp.array(dtype=int),
-    weight: wp.array(dtype=float),
+    keep: wp.array[int],
+    weight: wp.array[float],
     min_weight: float,
-    color: wp.array(dtype=wp.vec3),
-    listed: wp.array(dtype=int),
-    listed_count: wp.array(dtype=int),
+    color: wp.array[wp.vec3],
 ):
     """List the samples that weigh at least ``min_weight``, and make the others black."""
     tid = start + wp.tid()
@@ -148,22 +173,20 @@ def list_weighty(
             count += 1
         else:
             color[first + n] = wp.vec3()
-    place = start * sample_count + wp.atomic_add(listed_count, count_index(slot), count)
+    place = listed.start + wp.atomic_add(listed.counts, count_index(listed.slot), count)
     for n in range(sample_count):
         if weight[first + n] >= min_weight:
-            listed[place] = first + n
+            listed.samples[place] = first + n
             place += 1
 
 
 @wp.kernel(enable_backward=False)
 def list_steep(
     start: int,
-    slot: int,
+    listed: Listed,
     sample_count: int,
-    logit_grad: wp.array(dtype=float),
+    logit_grad: wp.array[float],
     min_gradient: float,
-    listed: wp.array(dtype=int),
-    listed_count: wp.array(dtype=int),
 ):
     """List the samples with a gradient beyond ``min_gradient``."""
     tid = start + wp.tid()
@@ -172,10 +195,10 @@ def list_steep(
     for n in range(sample_count):
         if wp.abs(logit_grad[first + n]) > min_gradient:
             count += 1
-    place = start * sample_count + wp.atomic_add(listed_count, count_index(slot), count)
+    place = listed.start + wp.atomic_add(listed.counts, count_index(listed.slot), count)
     for n in range(sample_count):
         if wp.abs(logit_grad[first + n]) > min_gradient:
-            listed[place] = first + n
+            listed.samples[place] = first + n
             place += 1
 
 
@@ -183,10 +206,10 @@ def list_steep(
 def composite_color(
     start: int,
     sample_count: int,
-    keep: wp.array(dtype=int),
-    color: wp.array(dtype=wp.vec3),
-    weight: wp.array(dtype=float),
-    rgb: wp.array(dtype=wp.vec3),
+    keep: wp.array[int],
+    color: wp.array[wp.vec3],
+    weight: wp.array[float],
+    rgb: wp.array[wp.vec3],
 ):
     tid = start + wp.tid()
     if keep[tid] == 0:
@@ -200,59 +223,53 @@ def composite_color(
 
 @wp.kernel(enable_backward=False)
 def surface_depth(
-    sample_count: int,
-    keep: wp.array(dtype=int),
-    z: wp.array(dtype=float),
-    logit: wp.array(dtype=float),
-    weight: wp.array(dtype=float),
+    rays: Rays,
+    keep: wp.array[int],
+    rendered: Rendered,
     min_occupancy: float,
-    depth: wp.array(dtype=float),
+    depth: wp.array[float],
 ):
     """Depth of the first sample that is occupied, or, where none is, of that at which half of the ray's weight is
     spent.
     """
     tid = wp.tid()
-    first = tid * sample_count
+    first = tid * rays.sample_count
     total = float(0.0)
-    for n in range(sample_count):
-        total += weight[first + n]
+    for n in range(rays.sample_count):
+        total += rendered.weight[first + n]
     spent = float(0.0)
     halfway = float(0.0)
     surface = float(0.0)
     if keep[tid] != 0:
-        for n in range(sample_count):
+        for n in range(rays.sample_count):
             i = first + n
-            spent += weight[i]
+            spent += rendered.weight[i]
             if halfway == 0.0 and spent >= 0.5 * total:
-                halfway = z[i]
-            if surface == 0.0 and logit[i] != OUTSIDE_LOGIT and occupancy(logit[i]) >= min_occupancy:
-                surface = z[i]
+                halfway = rays.z[i]
+            if surface == 0.0 and rendered.logit[i] != OUTSIDE_LOGIT and occupancy(rendered.logit[i]) >= min_occupancy:
+                surface = rays.z[i]
     depth[tid] = wp.where(surface > 0.0, surface, halfway)
 
 
 @wp.kernel(enable_backward=False)
 def composite_backward(
     start: int,
-    slot: int,
-    listed_count: wp.array(dtype=int),
-    sample_count: int,
-    z: wp.array(dtype=float),
-    keep: wp.array(dtype=int),
-    logit: wp.array(dtype=float),
+    listed: Listed,
+    rays: Rays,
+    keep: wp.array[int],
+    rendered: Rendered,
     with_color: int,
-    color: wp.array(dtype=wp.vec3),
-    weight: wp.array(dtype=float),
     min_weight: float,
-    depth_grad: wp.array(dtype=float),
-    rgb_grad: wp.array(dtype=wp.vec3),
-    logit_grad: wp.array(dtype=float),
-    color_grad: wp.array(dtype=wp.vec3),
+    depth_grad: wp.array[float],
+    rgb_grad: wp.array[wp.vec3],
+    logit_grad: wp.array[float],
+    color_grad: wp.array[wp.vec3],
 ):
     """Also empties the list that `list_steep` fills next."""
     tid = start + wp.tid()
     if wp.tid() == 0:
-        listed_count[count_index(slot)] = 0
-    first = tid * sample_count
+        listed.counts[count_index(listed.slot)] = 0
+    first = tid * rays.sample_count
     kept = keep[tid] != 0
     d_depth = depth_grad[tid]
     d_rgb = rgb_grad[tid]
@@ -260,18 +277,18 @@ def composite_backward(
     depth_grad[tid] = 0.0
     rgb_grad[tid] = wp.vec3()
     behind = float(0.0)
-    for m in range(sample_count):
-        i = first + sample_count - 1 - m
+    for m in range(rays.sample_count):
+        i = first + rays.sample_count - 1 - m
         gradient = float(0.0)
         if kept:
-            w = weight[i]
-            g = d_depth * z[i]
+            w = rendered.weight[i]
+            g = d_depth * rays.z[i]
             if with_color != 0:
-                g += wp.dot(d_rgb, color[i])
+                g += wp.dot(d_rgb, rendered.color[i])
                 color_grad[i] = wp.where(w < min_weight, wp.vec3(), w * d_rgb)
             # 100 marks a sample outside the bound: opaque, and constant.
-            if logit[i] != OUTSIDE_LOGIT:
-                alpha = occupancy(logit[i])
+            if rendered.logit[i] != OUTSIDE_LOGIT:
+                alpha = occupancy(rendered.logit[i])
                 free = 1.0 - alpha
                 # g_i T_i = g_i w_i / alpha_i; alpha > 0 unless the exponential overflowed, and then w and the
                 # gradient are 0.

@@ -13,7 +13,8 @@ has one order.
 
 import warp as wp
 
-from warpslam.kernels.compositing import OUTSIDE_LOGIT, count_index, occupancy
+from warpslam.kernels.compositing import OUTSIDE_LOGIT, Listed, Rendered, count_index, occupancy
+from warpslam.kernels.samples import Rays
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
@@ -33,45 +34,43 @@ MAX_ROTATION = wp.constant(wp.float64(0.05))
 @wp.kernel
 def ray_derivatives(
     start: int,
-    slot: int,
-    listed_count: wp.array(dtype=int),
-    sample_count: int,
-    z: wp.array(dtype=float),
-    inlier: wp.array(dtype=int),
-    logit: wp.array(dtype=float),
-    color: wp.array(dtype=wp.vec3),
-    weight: wp.array(dtype=float),
+    listed: Listed,
+    rays: Rays,
+    inlier: wp.array[int],
+    rendered: Rendered,
     min_weight: float,
     min_gradient: float,
-    by_logit: wp.array(dtype=wp.vec2),
-    wanted: wp.array(dtype=float),
-    color_grad: wp.array(dtype=wp.vec3),
+    by_logit: wp.array[wp.vec2],
+    wanted: wp.array[float],
+    color_grad: wp.array[wp.vec3],
 ):
     """Derivatives of depth and grey value by each logit; ``wanted`` is 1 where one of them exceeds ``min_gradient``.
     Also empties the list that `warpslam.kernels.compositing.list_steep` fills next.
     """
     tid = start + wp.tid()
     if wp.tid() == 0:
-        listed_count[count_index(slot)] = 0
+        listed.counts[count_index(listed.slot)] = 0
     depth_behind = float(0.0)
     grey_behind = float(0.0)
-    for m in range(sample_count):
-        i = (tid + 1) * sample_count - 1 - m
+    for m in range(rays.sample_count):
+        i = (tid + 1) * rays.sample_count - 1 - m
         derivatives = wp.vec2()
         want = float(0.0)
         by_color = wp.vec3()
         if inlier[tid] != 0:
-            w = weight[i]
-            grey = (color[i][0] + color[i][1] + color[i][2]) / 3.0
+            w = rendered.weight[i]
+            grey = (rendered.color[i][0] + rendered.color[i][1] + rendered.color[i][2]) / 3.0
             if w >= min_weight:
                 by_color = wp.vec3(w / 3.0, w / 3.0, w / 3.0)
-            if logit[i] != OUTSIDE_LOGIT:
-                alpha = occupancy(logit[i])
+            if rendered.logit[i] != OUTSIDE_LOGIT:
+                alpha = occupancy(rendered.logit[i])
                 free = 1.0 - alpha
                 blocked = alpha / (free + 1.0e-10)
-                derivatives = 10.0 * free * wp.vec2(z[i] * w - blocked * depth_behind, grey * w - blocked * grey_behind)
+                derivatives = (
+                    10.0 * free * wp.vec2(rays.z[i] * w - blocked * depth_behind, grey * w - blocked * grey_behind)
+                )
                 want = wp.where(wp.max(wp.abs(derivatives[0]), wp.abs(derivatives[1])) > min_gradient, 1.0, 0.0)
-            depth_behind += z[i] * w
+            depth_behind += rays.z[i] * w
             grey_behind += grey * w
         by_logit[i] = derivatives
         wanted[i] = want
@@ -87,14 +86,12 @@ def by_motion(direction: wp.vec3, by_origin: wp.vec3, by_direction: wp.vec3) -> 
 @wp.kernel
 def ray_jacobians(
     start: int,
-    sample_count: int,
-    z: wp.array(dtype=float),
-    ray_direction: wp.array(dtype=wp.vec3),
-    by_logit: wp.array(dtype=wp.vec2),
-    logit_by_point: wp.array(dtype=wp.vec3),
-    grey_by_point: wp.array(dtype=wp.vec3),
-    depth_by_motion: wp.array(dtype=Vec6),
-    grey_by_motion: wp.array(dtype=Vec6),
+    rays: Rays,
+    by_logit: wp.array[wp.vec2],
+    logit_by_point: wp.array[wp.vec3],
+    grey_by_point: wp.array[wp.vec3],
+    depth_by_motion: wp.array[Vec6],
+    grey_by_motion: wp.array[Vec6],
 ):
     """Rows of the Jacobian, one ray a thread; clears the derivatives by points for the next iteration."""
     tid = start + wp.tid()
@@ -102,18 +99,18 @@ def ray_jacobians(
     depth_direction = wp.vec3()
     grey_origin = wp.vec3()
     grey_direction = wp.vec3()
-    for n in range(sample_count):
-        i = tid * sample_count + n
+    for n in range(rays.sample_count):
+        i = tid * rays.sample_count + n
         d = by_logit[i][0] * logit_by_point[i]
         g = by_logit[i][1] * logit_by_point[i] + grey_by_point[i]
         depth_origin += d
-        depth_direction += z[i] * d
+        depth_direction += rays.z[i] * d
         grey_origin += g
-        grey_direction += z[i] * g
+        grey_direction += rays.z[i] * g
         logit_by_point[i] = wp.vec3()
         grey_by_point[i] = wp.vec3()
-    depth_by_motion[tid] = by_motion(ray_direction[tid], depth_origin, depth_direction)
-    grey_by_motion[tid] = by_motion(ray_direction[tid], grey_origin, grey_direction)
+    depth_by_motion[tid] = by_motion(rays.direction[tid], depth_origin, depth_direction)
+    grey_by_motion[tid] = by_motion(rays.direction[tid], grey_origin, grey_direction)
 
 
 @wp.func
@@ -149,36 +146,43 @@ def is_finite6(v: Vec6) -> bool:
     return wp.isfinite(total)
 
 
+@wp.struct
+class Residuals:
+    """What rays measure and render, which of them count, and the rows of the Jacobian."""
+
+    ray_count: int
+    color_weight: float
+    inlier: wp.array[int]
+    sigma: wp.array[float]
+    measured_depth: wp.array[float]
+    measured_rgb: wp.array[wp.vec3]
+    depth: wp.array[float]
+    rgb: wp.array[wp.vec3]
+    depth_by_motion: wp.array[Vec6]
+    grey_by_motion: wp.array[Vec6]
+
+
 @wp.func
 def sum_rays(
-    ray_count: int,
-    color_weight: float,
-    inlier: wp.array(dtype=int),
-    sigma: wp.array(dtype=float),
-    measured_depth: wp.array(dtype=float),
-    measured_rgb: wp.array(dtype=wp.vec3),
-    depth: wp.array(dtype=float),
-    rgb: wp.array(dtype=wp.vec3),
-    depth_by_motion: wp.array(dtype=Vec6),
-    grey_by_motion: wp.array(dtype=Vec6),
-    normal: wp.array(dtype=Mat66d),
-    right: wp.array(dtype=Vec6d),
+    residuals: Residuals,
+    normal: wp.array[Mat66d],
+    right: wp.array[Vec6d],
 ):
     H = Mat66d()
     b = Vec6d()
-    for n in range(ray_count):
-        if inlier[n] != 0:
-            error = measured_depth[n] - depth[n]
-            weight = 1.0 / (wp.max(sigma[n], SIGMA_FLOOR) * wp.max(wp.abs(error), DEPTH_FLOOR))
-            if is_finite6(depth_by_motion[n]) and wp.isfinite(weight * error):
-                J = Vec6d(depth_by_motion[n])
+    for n in range(residuals.ray_count):
+        if residuals.inlier[n] != 0:
+            error = residuals.measured_depth[n] - residuals.depth[n]
+            weight = 1.0 / (wp.max(residuals.sigma[n], SIGMA_FLOOR) * wp.max(wp.abs(error), DEPTH_FLOOR))
+            if is_finite6(residuals.depth_by_motion[n]) and wp.isfinite(weight * error):
+                J = Vec6d(residuals.depth_by_motion[n])
                 H += wp.float64(weight) * wp.outer(J, J)
                 b += wp.float64(weight * error) * J
-            difference = measured_rgb[n] - rgb[n]
+            difference = residuals.measured_rgb[n] - residuals.rgb[n]
             error = (difference[0] + difference[1] + difference[2]) / 3.0
-            weight = 3.0 * color_weight / wp.max(wp.abs(error), GREY_FLOOR)
-            if is_finite6(grey_by_motion[n]) and wp.isfinite(weight * error):
-                J = Vec6d(grey_by_motion[n])
+            weight = 3.0 * residuals.color_weight / wp.max(wp.abs(error), GREY_FLOOR)
+            if is_finite6(residuals.grey_by_motion[n]) and wp.isfinite(weight * error):
+                J = Vec6d(residuals.grey_by_motion[n])
                 H += wp.float64(weight) * wp.outer(J, J)
                 b += wp.float64(weight * error) * J
     normal[0] = H
@@ -187,35 +191,13 @@ def sum_rays(
 
 @wp.kernel
 def gauss_newton_step(
-    ray_count: int,
-    color_weight: float,
-    inlier: wp.array(dtype=int),
-    sigma: wp.array(dtype=float),
-    measured_depth: wp.array(dtype=float),
-    measured_rgb: wp.array(dtype=wp.vec3),
-    depth: wp.array(dtype=float),
-    rgb: wp.array(dtype=wp.vec3),
-    depth_by_motion: wp.array(dtype=Vec6),
-    grey_by_motion: wp.array(dtype=Vec6),
-    normal: wp.array(dtype=Mat66d),
-    right: wp.array(dtype=Vec6d),
-    poses: wp.array(dtype=float, ndim=2),
+    residuals: Residuals,
+    normal: wp.array[Mat66d],
+    right: wp.array[Vec6d],
+    poses: wp.array2d[float],
 ):
     """One damped step on the first pose vector (qw, qx, qy, qz, tx, ty, tz), by one thread."""
-    sum_rays(
-        ray_count,
-        color_weight,
-        inlier,
-        sigma,
-        measured_depth,
-        measured_rgb,
-        depth,
-        rgb,
-        depth_by_motion,
-        grey_by_motion,
-        normal,
-        right,
-    )
+    sum_rays(residuals, normal, right)
     H = normal[0]
     for k in range(6):
         H[k, k] = H[k, k] * (wp.float64(1.0) + DAMPING) + wp.float64(1.0e-9)

@@ -26,6 +26,14 @@ class Lattice:
 
 
 @wp.struct
+class Level:
+    """A grid as the decoders read it: where its vertices lie, and their features, one row a vertex."""
+
+    lattice: Lattice
+    features: wp.array[Vec32]
+
+
+@wp.struct
 class Cell:
     """Where a point lies in the lattice: lower corner, offset inside the cell in [0, 1], 1 on axes that are not
     clamped.
@@ -80,7 +88,7 @@ def corner_weight(offset: wp.vec3, di: int, dj: int, dk: int) -> float:
 
 
 @wp.func
-def interpolate(features: wp.array(dtype=Vec32), lattice: Lattice, cell: Cell) -> Vec32:
+def interpolate(level: Level, cell: Cell) -> Vec32:
     """Trilinear features at a point."""
     i = cell.corner[0]
     j = cell.corner[1]
@@ -89,8 +97,8 @@ def interpolate(features: wp.array(dtype=Vec32), lattice: Lattice, cell: Cell) -
     for di in range(2):
         for dj in range(2):
             for dk in range(2):
-                row = row_of(lattice, i + di, j + dj, k + dk)
-                c += corner_weight(cell.offset, di, dj, dk) * features[row]
+                row = row_of(level.lattice, i + di, j + dj, k + dk)
+                c += corner_weight(cell.offset, di, dj, dk) * level.features[row]
     return c
 
 
@@ -112,7 +120,7 @@ def dot32(a: Vec32, b: Vec32) -> float:
 
 
 @wp.func
-def interpolate_adjoint_point(features: wp.array(dtype=Vec32), lattice: Lattice, cell: Cell, dc: Vec32) -> wp.vec3:
+def interpolate_adjoint_point(level: Level, cell: Cell, dc: Vec32) -> wp.vec3:
     """Gradient with respect to the point."""
     i = cell.corner[0]
     j = cell.corner[1]
@@ -125,7 +133,7 @@ def interpolate_adjoint_point(features: wp.array(dtype=Vec32), lattice: Lattice,
     for di in range(2):
         for dj in range(2):
             for dk in range(2):
-                row = features[row_of(lattice, i + di, j + dj, k + dk)]
+                row = level.features[row_of(level.lattice, i + di, j + dj, k + dk)]
                 wx = wp.where(di == 1, f[0], 1.0 - f[0])
                 wy = wp.where(dj == 1, f[1], 1.0 - f[1])
                 wz = wp.where(dk == 1, f[2], 1.0 - f[2])
@@ -133,14 +141,14 @@ def interpolate_adjoint_point(features: wp.array(dtype=Vec32), lattice: Lattice,
                 along_y += wp.where(dj == 1, wx * wz, -wx * wz) * row
                 along_z += wp.where(dk == 1, wx * wy, -wx * wy) * row
     du = wp.vec3(dot32(dc, along_x), dot32(dc, along_y), dot32(dc, along_z))
-    return wp.cw_mul(wp.cw_mul(du, cell.free), lattice.inverse_spacing)
+    return wp.cw_mul(wp.cw_mul(du, cell.free), level.lattice.inverse_spacing)
 
 
 @wp.func
 def interpolate_adjoint_features(
-    grad: wp.array2d(dtype=Vec32),
+    grad: wp.array2d[Vec32],
     slot: int,
-    selected: wp.array(dtype=wp.uint8),
+    selected: wp.array[wp.uint8],
     lattice: Lattice,
     cell: Cell,
     dc: Vec32,
@@ -174,12 +182,11 @@ def fill_grid(
     seed: int,
     level: int,
     std: float,
-    old_lattice: Lattice,
-    old_features: wp.array(dtype=Vec32),
-    old_seen: wp.array(dtype=wp.uint8),
+    old: Level,
+    old_seen: wp.array[wp.uint8],
     shift: wp.vec3i,
-    features: wp.array(dtype=Vec32),
-    seen: wp.array(dtype=wp.uint8),
+    features: wp.array[Vec32],
+    seen: wp.array[wp.uint8],
 ):
     """Fill a grid of any extent: rows of the old grid are kept, the others start random (``first``: world index of
     vertex 0).
@@ -189,10 +196,10 @@ def fill_grid(
     a = i - shift[0]
     b = j - shift[1]
     c = k - shift[2]
-    s = old_lattice.shape
+    s = old.lattice.shape
     if a >= 0 and b >= 0 and c >= 0 and a < s[0] and b < s[1] and c < s[2]:
-        old_row = row_of(old_lattice, a, b, c)
-        features[row] = old_features[old_row]
+        old_row = row_of(old.lattice, a, b, c)
+        features[row] = old.features[old_row]
         seen[row] = old_seen[old_row]
     else:
         features[row] = init_normal(seed, level, first[0] + i, first[1] + j, first[2] + k, std)
@@ -200,7 +207,7 @@ def fill_grid(
 
 
 @wp.kernel(enable_backward=False)
-def copy_rows(rows: wp.array(dtype=int), source: wp.array(dtype=Vec32), target: wp.array(dtype=Vec32)):
+def copy_rows(rows: wp.array[int], source: wp.array[Vec32], target: wp.array[Vec32]):
     """Copy the rows that are listed from one grid to another of the same shape."""
     row = rows[wp.tid()]
     target[row] = source[row]

@@ -16,8 +16,9 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from warpslam.kernels.decoder import angles, sample_index, sample_point, sine_cosine
+from warpslam.kernels.decoder.embedding import angles, sine_cosine
 from warpslam.kernels.grid import Vec32, dot32, sum32
+from warpslam.kernels.samples import Rays, Span, sample_index, sample_point
 
 BLOCKS = 8
 EMBEDDING_BLOCKS = 3
@@ -36,6 +37,31 @@ TRANSPOSED_ROWS = 3 * 256 + 24 * 256
 FORWARD = wp.constant(0)
 ADJOINT = wp.constant(1)
 UNMASKED = wp.constant(2)
+
+
+@wp.struct
+class Layer:
+    """A layer, or its transpose: the rows from ``row`` on, ``in_blocks`` an output block, and the rows of the biases.
+
+    trips: 32, which CUDA's compiler must not know.
+    """
+
+    trips: int
+    in_blocks: int
+    W: wp.array[Vec32]
+    row: int
+    bias: wp.array[Vec32]
+    bias_row: int
+
+
+@wp.struct
+class Chunks:
+    """Points ``start`` to ``stop``, in chunks of ``size``, whose sums go to a gradient buffer ``slot``."""
+
+    start: int
+    stop: int
+    size: int
+    slot: int
 
 
 @wp.func
@@ -75,70 +101,52 @@ def imap_kernels(target: str) -> SimpleNamespace:
         return r
 
     @kernel
-    def embed(
-        first_ray: int,
-        first_sample: int,
-        width: int,
-        sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
-        W: wp.array(dtype=Vec32),
-        embedding: wp.array2d(dtype=Vec32),
-    ):
-        point = sample_index(wp.tid(), first_ray, first_sample, width, sample_count)
-        p = sample_point(point, sample_count, ray_origin, ray_direction, z)
+    def embed(span: Span, rays: Rays, W: wp.array[Vec32], embedding: wp.array2d[Vec32]):
+        point = sample_index(wp.tid(), span, rays.sample_count)
+        p = sample_point(point, rays)
         for chunk in range(3):
             embedding[chunk, point] = sine32(angles(p, W, chunk))
 
     @kernel
     def product(
-        point_count: int,
-        first_ray: int,
-        first_sample: int,
-        width: int,
+        span: Span,
         sample_count: int,
-        trips: int,
-        in_blocks: int,
-        W: wp.array(dtype=Vec32),
-        row: int,
-        bias: wp.array(dtype=Vec32),
-        bias_row: int,
-        x: wp.array2d(dtype=Vec32),
+        layer: Layer,
+        x: wp.array2d[Vec32],
         mode: int,
-        gate: wp.array2d(dtype=Vec32),
-        y: wp.array2d(dtype=Vec32),
+        gate: wp.array2d[Vec32],
+        y: wp.array2d[Vec32],
     ):
         """A layer forward (FORWARD: bias and ReLU), or its adjoint (ADJOINT: masked by ``gate``; UNMASKED)."""
         block, group = wp.tid()
         # The last group may be short of points: it computes its last one again.
-        last = point_count - 1
-        p0 = sample_index(wp.min(4 * group, last), first_ray, first_sample, width, sample_count)
-        p1 = sample_index(wp.min(4 * group + 1, last), first_ray, first_sample, width, sample_count)
-        p2 = sample_index(wp.min(4 * group + 2, last), first_ray, first_sample, width, sample_count)
-        p3 = sample_index(wp.min(4 * group + 3, last), first_ray, first_sample, width, sample_count)
+        last = span.point_count - 1
+        p0 = sample_index(wp.min(4 * group, last), span, sample_count)
+        p1 = sample_index(wp.min(4 * group + 1, last), span, sample_count)
+        p2 = sample_index(wp.min(4 * group + 2, last), span, sample_count)
+        p3 = sample_index(wp.min(4 * group + 3, last), span, sample_count)
         r0 = Vec32()
         if mode == FORWARD:
-            r0 = Vec32(bias[bias_row + block])
+            r0 = Vec32(layer.bias[layer.bias_row + block])
         r1 = Vec32(r0)
         r2 = Vec32(r0)
         r3 = Vec32(r0)
-        for source in range(in_blocks):
+        for source in range(layer.in_blocks):
             x0 = x[source, p0]
             x1 = x[source, p1]
             x2 = x[source, p2]
             x3 = x[source, p3]
-            first = row + 32 * (block * in_blocks + source)
+            first = layer.row + 32 * (block * layer.in_blocks + source)
             if wp.static(unrolled):
                 for k in range(32):
-                    w = W[first + k]
+                    w = layer.W[first + k]
                     r0 += x0[k] * w
                     r1 += x1[k] * w
                     r2 += x2[k] * w
                     r3 += x3[k] * w
             else:
-                for k in range(trips):
-                    w = W[first + k]
+                for k in range(layer.trips):
+                    w = layer.W[first + k]
                     r0 += x0[k] * w
                     r1 += x1[k] * w
                     r2 += x2[k] * w
@@ -161,16 +169,14 @@ def imap_kernels(target: str) -> SimpleNamespace:
 
     @kernel
     def output(
-        first_ray: int,
-        first_sample: int,
-        width: int,
+        span: Span,
         sample_count: int,
-        W: wp.array(dtype=Vec32),
-        h: wp.array2d(dtype=Vec32),
-        color: wp.array(dtype=wp.vec3),
-        density: wp.array(dtype=float),
+        W: wp.array[Vec32],
+        h: wp.array2d[Vec32],
+        color: wp.array[wp.vec3],
+        density: wp.array[float],
     ):
-        point = sample_index(wp.tid(), first_ray, first_sample, width, sample_count)
+        point = sample_index(wp.tid(), span, sample_count)
         raw = wp.vec4()
         for channel in range(4):
             total = Vec32()
@@ -183,11 +189,11 @@ def imap_kernels(target: str) -> SimpleNamespace:
     @kernel
     def output_backward(
         start: int,
-        W: wp.array(dtype=Vec32),
-        h: wp.array2d(dtype=Vec32),
-        color_grad: wp.array(dtype=wp.vec3),
-        density_grad: wp.array(dtype=float),
-        d: wp.array2d(dtype=Vec32),
+        W: wp.array[Vec32],
+        h: wp.array2d[Vec32],
+        color_grad: wp.array[wp.vec3],
+        density_grad: wp.array[float],
+        d: wp.array2d[Vec32],
     ):
         point = start + wp.tid()
         c = color_grad[point]
@@ -199,18 +205,15 @@ def imap_kernels(target: str) -> SimpleNamespace:
     @kernel
     def embed_backward(
         start: int,
-        sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
-        W: wp.array(dtype=Vec32),
-        d: wp.array2d(dtype=Vec32),
+        rays: Rays,
+        W: wp.array[Vec32],
+        d: wp.array2d[Vec32],
         want_point: int,
-        point_grad: wp.array(dtype=wp.vec3),
+        point_grad: wp.array[wp.vec3],
     ):
         """From the gradient of the embedding to that of its angles p B (in place), and of the point."""
         point = start + wp.tid()
-        p = sample_point(point, sample_count, ray_origin, ray_direction, z)
+        p = sample_point(point, rays)
         dp = wp.vec3()
         for chunk in range(3):
             da = wp.cw_mul(d[chunk, point], cosine32(angles(p, W, chunk)))
@@ -225,23 +228,20 @@ def imap_kernels(target: str) -> SimpleNamespace:
 
     @kernel
     def layer_weights(
-        start: int,
-        stop: int,
-        chunk_size: int,
-        slot: int,
+        chunks: Chunks,
         in_blocks: int,
         row: int,
-        x: wp.array3d(dtype=float),
-        d: wp.array2d(dtype=Vec32),
-        grad: wp.array2d(dtype=Vec32),
+        x: wp.array3d[float],
+        d: wp.array2d[Vec32],
+        grad: wp.array2d[Vec32],
     ):
         """x^T d over a chunk of points: rows 8 r to 8 r + 7 of the input, one block of the output, a thread.
 
         ``x`` are activations with their channels as a third axis: reading one channel must not load the other 31.
         """
         chunk, block, r = wp.tid()
-        first = start + chunk * chunk_size
-        last = wp.min(first + chunk_size, stop)
+        first = chunks.start + chunk * chunks.size
+        last = wp.min(first + chunks.size, chunks.stop)
         source = r // 4
         k = 8 * (r % 4)
         g0 = Vec32()
@@ -263,47 +263,41 @@ def imap_kernels(target: str) -> SimpleNamespace:
             g6 += x[source, n, k + 6] * dn
             g7 += x[source, n, k + 7] * dn
         target_row = row + 32 * (block * in_blocks + source) + k
-        wp.atomic_add(grad, slot, target_row, g0)
-        wp.atomic_add(grad, slot, target_row + 1, g1)
-        wp.atomic_add(grad, slot, target_row + 2, g2)
-        wp.atomic_add(grad, slot, target_row + 3, g3)
-        wp.atomic_add(grad, slot, target_row + 4, g4)
-        wp.atomic_add(grad, slot, target_row + 5, g5)
-        wp.atomic_add(grad, slot, target_row + 6, g6)
-        wp.atomic_add(grad, slot, target_row + 7, g7)
+        wp.atomic_add(grad, chunks.slot, target_row, g0)
+        wp.atomic_add(grad, chunks.slot, target_row + 1, g1)
+        wp.atomic_add(grad, chunks.slot, target_row + 2, g2)
+        wp.atomic_add(grad, chunks.slot, target_row + 3, g3)
+        wp.atomic_add(grad, chunks.slot, target_row + 4, g4)
+        wp.atomic_add(grad, chunks.slot, target_row + 5, g5)
+        wp.atomic_add(grad, chunks.slot, target_row + 6, g6)
+        wp.atomic_add(grad, chunks.slot, target_row + 7, g7)
 
     @kernel
     def bias_weights(
-        start: int,
-        stop: int,
-        chunk_size: int,
-        slot: int,
+        chunks: Chunks,
         row: int,
-        d: wp.array2d(dtype=Vec32),
-        grad: wp.array2d(dtype=Vec32),
+        d: wp.array2d[Vec32],
+        grad: wp.array2d[Vec32],
     ):
         chunk, block = wp.tid()
-        first = start + chunk * chunk_size
-        last = wp.min(first + chunk_size, stop)
+        first = chunks.start + chunk * chunks.size
+        last = wp.min(first + chunks.size, chunks.stop)
         g = Vec32()
         for n in range(first, last):
             g += d[block, n]
-        wp.atomic_add(grad, slot, row + block, g)
+        wp.atomic_add(grad, chunks.slot, row + block, g)
 
     @kernel
     def output_weights(
-        start: int,
-        stop: int,
-        chunk_size: int,
-        slot: int,
-        h: wp.array2d(dtype=Vec32),
-        color_grad: wp.array(dtype=wp.vec3),
-        density_grad: wp.array(dtype=float),
-        grad: wp.array2d(dtype=Vec32),
+        chunks: Chunks,
+        h: wp.array2d[Vec32],
+        color_grad: wp.array[wp.vec3],
+        density_grad: wp.array[float],
+        grad: wp.array2d[Vec32],
     ):
         chunk, block = wp.tid()
-        first = start + chunk * chunk_size
-        last = wp.min(first + chunk_size, stop)
+        first = chunks.start + chunk * chunks.size
+        last = wp.min(first + chunks.size, chunks.stop)
         red = Vec32()
         green = Vec32()
         blue = Vec32()
@@ -321,44 +315,38 @@ def imap_kernels(target: str) -> SimpleNamespace:
             bias[1] = bias[1] + c[1]
             bias[2] = bias[2] + c[2]
             bias[3] = bias[3] + s
-        wp.atomic_add(grad, slot, OUT + block, red)
-        wp.atomic_add(grad, slot, OUT + 8 + block, green)
-        wp.atomic_add(grad, slot, OUT + 16 + block, blue)
-        wp.atomic_add(grad, slot, OUT + 24 + block, dense)
+        wp.atomic_add(grad, chunks.slot, OUT + block, red)
+        wp.atomic_add(grad, chunks.slot, OUT + 8 + block, green)
+        wp.atomic_add(grad, chunks.slot, OUT + 16 + block, blue)
+        wp.atomic_add(grad, chunks.slot, OUT + 24 + block, dense)
         if block == 0:
-            wp.atomic_add(grad, slot, OUT + 32, bias)
+            wp.atomic_add(grad, chunks.slot, OUT + 32, bias)
 
     @kernel
     def embedding_weights(
-        start: int,
-        stop: int,
-        chunk_size: int,
-        slot: int,
-        sample_count: int,
-        ray_origin: wp.array(dtype=wp.vec3),
-        ray_direction: wp.array(dtype=wp.vec3),
-        z: wp.array(dtype=float),
-        d: wp.array2d(dtype=Vec32),
-        grad: wp.array2d(dtype=Vec32),
+        chunks: Chunks,
+        rays: Rays,
+        d: wp.array2d[Vec32],
+        grad: wp.array2d[Vec32],
     ):
         """Gradient of B, after `embed_backward`."""
         chunk, third = wp.tid()
-        first = start + chunk * chunk_size
-        last = wp.min(first + chunk_size, stop)
+        first = chunks.start + chunk * chunks.size
+        last = wp.min(first + chunks.size, chunks.stop)
         gx = Vec32()
         gy = Vec32()
         gz = Vec32()
         for n in range(first, last):
-            p = sample_point(n, sample_count, ray_origin, ray_direction, z)
+            p = sample_point(n, rays)
             gx += p[0] * d[third, n]
             gy += p[1] * d[third, n]
             gz += p[2] * d[third, n]
-        wp.atomic_add(grad, slot, 3 * third, gx)
-        wp.atomic_add(grad, slot, 3 * third + 1, gy)
-        wp.atomic_add(grad, slot, 3 * third + 2, gz)
+        wp.atomic_add(grad, chunks.slot, 3 * third, gx)
+        wp.atomic_add(grad, chunks.slot, 3 * third + 1, gy)
+        wp.atomic_add(grad, chunks.slot, 3 * third + 2, gz)
 
     @kernel
-    def transpose(in_blocks: int, row: int, row_T: int, W: wp.array(dtype=Vec32), T: wp.array(dtype=Vec32)):
+    def transpose(in_blocks: int, row: int, row_T: int, W: wp.array[Vec32], T: wp.array[Vec32]):
         """Bring a layer's transposed rows in line with its weights: one thread a row of ``T``."""
         tid = wp.tid()
         source = tid // 256

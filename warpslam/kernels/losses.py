@@ -19,14 +19,14 @@ def l1(a: wp.vec3, b: wp.vec3) -> float:
 
 @wp.kernel
 def mapping_loss(
-    keep: wp.array(dtype=int),
-    measured_depth: wp.array(dtype=float),
-    measured_rgb: wp.array(dtype=wp.vec3),
+    keep: wp.array[int],
+    measured_depth: wp.array[float],
+    measured_rgb: wp.array[wp.vec3],
     depth_weight: float,
     color_weight: float,
-    depth: wp.array(dtype=float),
-    rgb: wp.array(dtype=wp.vec3),
-    loss: wp.array(dtype=float),
+    depth: wp.array[float],
+    rgb: wp.array[wp.vec3],
+    loss: wp.array[float],
 ):
     tid = wp.tid()
     if keep[tid] != 0:
@@ -40,15 +40,15 @@ def mapping_loss(
 
 @wp.kernel(enable_backward=False)
 def tracking_residuals(
-    keep: wp.array(dtype=int),
-    measured_depth: wp.array(dtype=float),
-    depth: wp.array(dtype=float),
-    variance: wp.array(dtype=float),
+    keep: wp.array[int],
+    measured_depth: wp.array[float],
+    depth: wp.array[float],
+    variance: wp.array[float],
     include_missing: int,
     normalize: int,
-    sigma: wp.array(dtype=float),
-    residual: wp.array(dtype=float),
-    candidate_count: wp.array(dtype=int),
+    sigma: wp.array[float],
+    residual: wp.array[float],
+    candidate_count: wp.array[int],
 ):
     """Depth residuals, in metres or in standard deviations; those the median runs over are >= 0, the others -1 (rays
     without depth: an option).
@@ -66,7 +66,7 @@ def tracking_residuals(
 
 
 @wp.func
-def rank_of(residual: wp.array(dtype=float), index: int) -> int:
+def rank_of(residual: wp.array[float], index: int) -> int:
     r = residual[index]
     rank = int(0)
     for n in range(residual.shape[0]):
@@ -78,7 +78,7 @@ def rank_of(residual: wp.array(dtype=float), index: int) -> int:
 
 
 @wp.kernel(enable_backward=False)
-def lower_median(residual: wp.array(dtype=float), candidate_count: wp.array(dtype=int), median: wp.array(dtype=float)):
+def lower_median(residual: wp.array[float], candidate_count: wp.array[int], median: wp.array[float]):
     """The lower median of the residuals that are >= 0: each thread ranks its own value."""
     tid = wp.tid()
     if residual[tid] >= 0.0:
@@ -88,13 +88,13 @@ def lower_median(residual: wp.array(dtype=float), candidate_count: wp.array(dtyp
 
 @wp.kernel(enable_backward=False)
 def choose_inliers(
-    keep: wp.array(dtype=int),
-    measured_depth: wp.array(dtype=float),
-    residual: wp.array(dtype=float),
-    median: wp.array(dtype=float),
+    keep: wp.array[int],
+    measured_depth: wp.array[float],
+    residual: wp.array[float],
+    median: wp.array[float],
     factor: float,
-    inlier: wp.array(dtype=int),
-    inlier_count: wp.array(dtype=int),
+    inlier: wp.array[int],
+    inlier_count: wp.array[int],
 ):
     """``factor`` x the median bounds an inlier's residual; a factor of 0 turns the filter off."""
     tid = wp.tid()
@@ -108,15 +108,15 @@ def choose_inliers(
 
 @wp.kernel
 def tracking_loss(
-    inlier: wp.array(dtype=int),
-    measured_depth: wp.array(dtype=float),
-    measured_rgb: wp.array(dtype=wp.vec3),
-    sigma: wp.array(dtype=float),
+    inlier: wp.array[int],
+    measured_depth: wp.array[float],
+    measured_rgb: wp.array[wp.vec3],
+    sigma: wp.array[float],
     depth_weight: float,
     color_weight: float,
-    depth: wp.array(dtype=float),
-    rgb: wp.array(dtype=wp.vec3),
-    loss: wp.array(dtype=float),
+    depth: wp.array[float],
+    rgb: wp.array[wp.vec3],
+    loss: wp.array[float],
 ):
     tid = wp.tid()
     if inlier[tid] != 0:

@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def texel(texels: wp.array(dtype=wp.vec3ub), first: int, width: int, height: int, x: int, y: int):
+def texel(texels: wp.array[wp.vec3ub], first: int, width: int, height: int, x: int, y: int):
     """Colour of one texel, 0..255; outside of [0, 1] a texture repeats."""
     column = ((x % width) + width) % width
     row = ((y % height) + height) % height
@@ -18,7 +18,7 @@ def texel(texels: wp.array(dtype=wp.vec3ub), first: int, width: int, height: int
 
 
 @wp.func
-def bilinear(texels: wp.array(dtype=wp.vec3ub), first: int, width: int, height: int, uv: wp.vec2):
+def bilinear(texels: wp.array[wp.vec3ub], first: int, width: int, height: int, uv: wp.vec2):
     """Blend of the four texels around a texture coordinate."""
     x = uv[0] * float(width) - 0.5
     # Row 0 of the image is its top, v = 1.
@@ -36,53 +36,60 @@ def bilinear(texels: wp.array(dtype=wp.vec3ub), first: int, width: int, height: 
     return (1.0 - b) * top + b * low
 
 
+@wp.struct
+class TexturedMesh:
+    """A `wp.Mesh` and how its faces look."""
+
+    mesh: wp.uint64
+    faces: wp.array[wp.int32]  # (3 F,)
+    colors: wp.array[wp.vec3]  # (V,) 0..255
+    uvs: wp.array[wp.vec2]  # (V,)
+    shade: wp.array[wp.float32]  # (F,)
+    material: wp.array[wp.int32]  # (F,), -1 = vertex colours
+    textures: wp.array[wp.vec3i]  # (M,): first texel, width, height
+    texels: wp.array[wp.vec3ub]  # (T,)
+
+
 @wp.kernel
 def render_mesh(
-    mesh: wp.uint64,
-    faces: wp.array(dtype=wp.int32),  # (3 F,)
-    colors: wp.array(dtype=wp.vec3),  # (V,) 0..255
-    uvs: wp.array(dtype=wp.vec2),  # (V,)
-    shade: wp.array(dtype=wp.float32),  # (F,)
-    material: wp.array(dtype=wp.int32),  # (F,), -1 = vertex colours
-    textures: wp.array(dtype=wp.vec3i),  # (M,): first texel, width, height
-    texels: wp.array(dtype=wp.vec3ub),  # (T,)
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
+    scene: TexturedMesh,
+    focal: wp.vec2,
+    center: wp.vec2,
     rotation: wp.mat33,  # camera to world
     origin: wp.vec3,
     max_depth: float,
-    rgb: wp.array(dtype=wp.vec3ub, ndim=2),  # (H, W)
-    depth: wp.array(dtype=wp.float32, ndim=2),  # (H, W) [m], 0 = miss
+    rgb: wp.array2d[wp.vec3ub],  # (H, W)
+    depth: wp.array2d[wp.float32],  # (H, W) [m], 0 = miss
 ):
     """Cast the ray of one pixel and write its colour and z-depth."""
     j, i = wp.tid()
-    ray = wp.vec3((float(i) - cx) / fx, (float(j) - cy) / fy, 1.0)
+    ray = wp.vec3((float(i) - center[0]) / focal[0], (float(j) - center[1]) / focal[1], 1.0)
     length = wp.length(ray)
-    query = wp.mesh_query_ray(mesh, origin, rotation * (ray / length), max_depth * length)
+    query = wp.mesh_query_ray(scene.mesh, origin, rotation * (ray / length), max_depth * length)
     if not query.result:
         # A ray through a seam of differently subdivided triangles can slip between them: look 0.02 px beside it.
-        ray = ray + wp.vec3(0.02 / fx, 0.013 / fy, 0.0)
+        ray = ray + wp.vec3(0.02 / focal[0], 0.013 / focal[1], 0.0)
         length = wp.length(ray)
-        query = wp.mesh_query_ray(mesh, origin, rotation * (ray / length), max_depth * length)
+        query = wp.mesh_query_ray(scene.mesh, origin, rotation * (ray / length), max_depth * length)
     if not query.result:
         rgb[j, i] = wp.vec3ub(wp.uint8(0), wp.uint8(0), wp.uint8(0))
         depth[j, i] = 0.0
         return
     depth[j, i] = query.t / length
     f = query.face
-    a = faces[3 * f]
-    b = faces[3 * f + 1]
-    c = faces[3 * f + 2]
+    a = scene.faces[3 * f]
+    b = scene.faces[3 * f + 1]
+    c = scene.faces[3 * f + 2]
     u = query.u
     v = query.v
     w = 1.0 - u - v
-    color = u * colors[a] + v * colors[b] + w * colors[c]
-    if material[f] >= 0:
-        texture = textures[material[f]]
-        color = bilinear(texels, texture[0], texture[1], texture[2], u * uvs[a] + v * uvs[b] + w * uvs[c])
-    color = color * shade[f]
+    color = u * scene.colors[a] + v * scene.colors[b] + w * scene.colors[c]
+    if scene.material[f] >= 0:
+        texture = scene.textures[scene.material[f]]
+        color = bilinear(
+            scene.texels, texture[0], texture[1], texture[2], u * scene.uvs[a] + v * scene.uvs[b] + w * scene.uvs[c]
+        )
+    color = color * scene.shade[f]
     rgb[j, i] = wp.vec3ub(
         wp.uint8(wp.clamp(color[0] + 0.5, 0.0, 255.0)),
         wp.uint8(wp.clamp(color[1] + 0.5, 0.0, 255.0)),

@@ -11,9 +11,10 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.config import SamplingConfig
-from warpslam.field.arrays import EXACT, FieldArrays, camera_vectors
-from warpslam.field.ray_batch import RayBatch
-from warpslam.kernels import rays
+from warpslam.field.arrays import EXACT, FieldArrays, camera_struct
+from warpslam.field.passes import render
+from warpslam.field.ray_batch import RayBatch, image_struct
+from warpslam.kernels import pixels
 from warpslam.runtime.launching import Launcher
 from warpslam.runtime.phases import phase
 
@@ -54,13 +55,11 @@ class CellErrors:
         frames = window.shape[0]
         batch.set_seeds([seed])
         batch.count = frames * self.cell_count
-        _, depth, scale = images
-        inputs = [batch.seeds, batch.iteration, window, wp.vec2i(*CELLS), *camera_vectors(camera), depth, scale]
-        inputs += [batch.frame, batch.direction_camera, batch.measured_depth]
-        self._launcher.launch(rays.probe_pixels, batch.count, inputs)
+        inputs = [batch.draws, window, wp.vec2i(*CELLS), camera_struct(camera), image_struct(images), batch.pixels]
+        self._launcher.launch(pixels.probe_pixels, batch.count, inputs)
         batch.cast(poses, differentiate=False)
         batch.bound(arrays)
         batch.place_samples(self.sampling.stratified, self.sampling.surface, jitter=self.sampling.jitter)
-        batch.render(arrays, "fine", thresholds=EXACT)
+        render(batch, arrays, "fine", thresholds=EXACT)
         inputs = [self.cell_count, LARGEST_ERROR, batch.keep, batch.measured_depth, batch.depth, self.cumulative]
-        self._launcher.launch(rays.accumulate_errors, frames, inputs)
+        self._launcher.launch(pixels.accumulate_errors, frames, inputs)

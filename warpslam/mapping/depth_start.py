@@ -18,9 +18,9 @@ import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics
-from warpslam.field.arrays import projection
+from warpslam.field.arrays import projection, struct
 from warpslam.field.decoders import BLOCK_COUNT, EMBEDDING_SIZE, FEATURE_SIZE, SKIP_BLOCK, DecoderWeights
-from warpslam.kernels import frustum
+from warpslam.kernels import seen
 from warpslam.kernels.grid import Vec32
 from warpslam.mapping.frustum import REACH
 from warpslam.runtime.phases import phase
@@ -59,10 +59,16 @@ class DepthStart:
             depth: Depth image on the device [m], float32 (H, W), 0 = missing.
             selected: Only vertices that are 1 here change, uint8 (rows,).
         """
-        inputs = [grid.lattice, *projection(camera, T_world_camera), depth, selected]
-        inputs += [Vec32(*self.base), Vec32(*self.slope), TRUNCATION * grid.spacing, REACH * grid.spacing]
+        line = struct(
+            seen.FeatureLine,
+            base=Vec32(*self.base),
+            slope=Vec32(*self.slope),
+            truncation=TRUNCATION * grid.spacing,
+            reach=REACH * grid.spacing,
+        )
+        inputs = [grid.lattice, *projection(camera, T_world_camera), depth, selected, line]
         wp.launch(
-            frustum.start_from_depth,
+            seen.start_from_depth,
             dim=grid.shape,
             inputs=inputs,
             outputs=[grid.seen, grid.features],

@@ -11,7 +11,7 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.field.arrays import projection
-from warpslam.kernels import frustum
+from warpslam.kernels import frustum, seen
 from warpslam.kernels.grid import Lattice
 from warpslam.runtime.phases import phase
 
@@ -73,7 +73,7 @@ def mark_seen(grid: FeatureGrid, camera: Intrinsics, T_world_camera: np.ndarray,
         camera, T_world_camera, depth: As in `select_in_frustum`.
     """
     inputs = [grid.lattice, *projection(camera, T_world_camera), depth, REACH * grid.spacing]
-    wp.launch(frustum.mark_seen, grid.shape, inputs, [grid.seen], device=grid.device, record_tape=False)
+    wp.launch(seen.mark_seen, grid.shape, inputs, [grid.seen], device=grid.device, record_tape=False)
 
 
 def measured_extent(

@@ -15,7 +15,9 @@ import warp as wp
 from warpslam.camera import Intrinsics
 from warpslam.config import MappingConfig, SamplingConfig
 from warpslam.field.arrays import Gradients, Thresholds
-from warpslam.field.ray_batch import STAGES, RayBatch
+from warpslam.field.objectives import choose_inliers, mapping_loss
+from warpslam.field.passes import STAGES, render
+from warpslam.field.ray_batch import RayBatch
 from warpslam.field.seeds import ray_seed
 from warpslam.mapping.active_sampling import CellErrors
 from warpslam.mapping.depth_start import DepthStart
@@ -302,10 +304,10 @@ class Mapper:
             batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)
             scale = 1.0 / batch.count if config.loss == "mean" else 1.0
             thresholds = Thresholds(sampling.min_weight, sampling.min_gradient * scale, sampling.min_transmittance)
-            batch.render(arrays, stage, gradients, tape, thresholds=thresholds)
+            render(batch, arrays, stage, gradients, tape, thresholds=thresholds)
             if gradients.points and gradients.inliers_move:
-                batch.choose_inliers(config.bundle_adjustment_filter, normalized=False)
-            batch.mapping_loss(config.color_weight * scale if color else 0.0, scale)
+                choose_inliers(batch, config.bundle_adjustment_filter, normalized=False)
+            mapping_loss(batch, config.color_weight * scale if color else 0.0, scale)
         self._launcher.call(partial(tape.backward, batch.loss))
         rates = {
             "middle": config.middle_rate if stage == "middle" else config.geometry_rate,
@@ -343,8 +345,8 @@ class Mapper:
                 batch.cast(poses)
                 batch.bound(arrays, use_depth=False)
                 batch.place_samples(sampling.stratified, 0, use_depth=False, jitter=sampling.jitter)
-                batch.render(arrays, "coarse", gradients, tape)
-                batch.mapping_loss(0.0, 1.0 / batch.count if config.loss == "mean" else 1.0)
+                render(batch, arrays, "coarse", gradients, tape)
+                mapping_loss(batch, 0.0, 1.0 / batch.count if config.loss == "mean" else 1.0)
             self._launcher.call(partial(tape.backward, batch.loss))
             optimizer.update(self.scene.grids["coarse"].features, config.coarse_rate * rate_factor)
             batch.next_iteration()

@@ -1,14 +1,10 @@
 """What the depth images are evidence of: space that was observed, space near a surface, space only in reach.
 
-How a point p is judged in a view. Let it project to pixel (u, v) at z-depth Z. The inverse depth of a plane is affine
-in (u, v), so four neighbouring depths of one surface give the plane a X + b Y + c Z = 1 (camera coordinates),
-    a = fx dw/du,  b = fy dw/dv,  c = w(u, v) - a X/Z - b Y/Z,    w = 1 / depth, interpolated,
-and the signed distance of p to it is s = (1 - Z w) / |(a, b, c)|, positive in front. At depth edges s = depth - Z with
-the nearest pixel. Along z alone, a floor seen from far would lose the lattice layer below it: 10 cm of z can be 1 cm of
-height. p is *observed* if s >= -behind in some view, and *near* a surface if |s| <= band in some view.
+How a point is judged in a view, and what *observed* and *near* are: `warpslam.kernels.visibility`. Behind a surface
+means behind it by no more than `behind`, near it no farther than `band`.
 
-p is *in reach* of a view (A.4) if it lies no deeper than the view's largest depth and projects into its image, enlarged
-on every side.
+A point is *in reach* of a view (A.4) if it lies no deeper than the view's largest depth and projects into its image,
+enlarged on every side.
 """
 
 from __future__ import annotations
@@ -21,161 +17,17 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.errors import InputError, MeshError
+from warpslam.kernels.visibility import NEAR, Views, classify_points, find_facing, find_reached
 from warpslam.scene.mapped_views import ObservedView
 
 # The reference enlarges images by 1000 px; in focal lengths of its Replica camera (600 px), as images have many sizes.
 REACH_MARGIN = 1000.0 / 600.0
 
-_NOT_SEEN = wp.constant(-1.0e30)
-_NEAREST_Z = 1.0e-3
-# Neighbouring depths that differ by more than this share are two surfaces, not one slanted surface.
-_DEPTH_EDGE = wp.constant(0.1)
 # At grazing angles the distance to a surface is far shorter than the way along z; these bound that way, behind it as a
 # multiple of behind and in front of it as a multiple of the band. They also spare most points the plane.
 _MAX_BEHIND_ALONG_Z = 3.0
 _MAX_FRONT_ALONG_Z = 5.0
 _CLOUD_SIZE = 200_000
-
-
-_OBSERVED = wp.constant(1)
-_NEAR = wp.constant(2)
-
-
-@wp.func
-def _signed_distance(
-    p: wp.vec3,
-    view: int,
-    T_camera_world: wp.array[wp.mat44],
-    pinhole: wp.array[wp.vec4],
-    image: wp.array[wp.vec3i],
-    depth: wp.array[wp.float32],
-    max_behind: float,
-    max_front: float,
-) -> float:
-    """Signed distance [m] to the surface that `view` measured on the ray of `p`; _NOT_SEEN where it measured none."""
-    q = wp.transform_point(T_camera_world[view], p)
-    if q[2] <= _NEAREST_Z:
-        return _NOT_SEEN
-    x = q[0] / q[2]
-    y = q[1] / q[2]
-    f = pinhole[view]
-    u = f[0] * x + f[2]
-    v = f[1] * y + f[3]
-    start = image[view][0]
-    width = image[view][1]
-    height = image[view][2]
-    if u < -0.5 or v < -0.5 or u >= float(width) - 0.5 or v >= float(height) - 0.5:
-        return _NOT_SEEN
-    nearest = depth[start + int(v + 0.5) * width + int(u + 0.5)]
-    distance = nearest - q[2]
-    if nearest <= 0.0 or distance < -max_behind:
-        return _NOT_SEEN
-    if distance > max_front:
-        return distance
-    i = wp.min(int(wp.max(u, 0.0)), width - 2)
-    j = wp.min(int(wp.max(v, 0.0)), height - 2)
-    corner = start + j * width + i
-    d00 = depth[corner]
-    d01 = depth[corner + 1]
-    d10 = depth[corner + width]
-    d11 = depth[corner + width + 1]
-    least = wp.min(wp.min(d00, d01), wp.min(d10, d11))
-    most = wp.max(wp.max(d00, d01), wp.max(d10, d11))
-    if least > 0.0 and most - least <= _DEPTH_EDGE * least:
-        s = u - float(i)
-        t = v - float(j)
-        w00 = 1.0 / d00
-        w01 = 1.0 / d01
-        w10 = 1.0 / d10
-        w11 = 1.0 / d11
-        w = wp.lerp(wp.lerp(w00, w01, s), wp.lerp(w10, w11, s), t)
-        a = f[0] * wp.lerp(w01 - w00, w11 - w10, t)
-        b = f[1] * wp.lerp(w10 - w00, w11 - w01, s)
-        c = w - a * x - b * y
-        distance = (1.0 - q[2] * w) / wp.length(wp.vec3(a, b, c))
-    return distance
-
-
-@wp.kernel(enable_backward=False)
-def _classify_kernel(
-    first: wp.vec3i,
-    voxel: float,
-    visible: wp.array[wp.int32],
-    T_camera_world: wp.array[wp.mat44],
-    pinhole: wp.array[wp.vec4],
-    image: wp.array[wp.vec3i],
-    depth: wp.array[wp.float32],
-    max_behind: float,
-    max_front: float,
-    behind: float,
-    band: float,
-    state: wp.array3d[wp.uint8],
-):
-    i, j, k = wp.tid()
-    p = wp.vec3(float(first[0] + i) * voxel, float(first[1] + j) * voxel, float(first[2] + k) * voxel)
-    observed = wp.bool(False)
-    near = wp.bool(False)
-    for n in range(visible.shape[0]):
-        s = _signed_distance(p, visible[n], T_camera_world, pinhole, image, depth, max_behind, max_front)
-        if s > _NOT_SEEN:
-            observed = observed or s >= -behind
-            near = near or wp.abs(s) <= band
-        if observed and near:
-            break
-    if observed:
-        state[i, j, k] = wp.uint8(wp.where(near, _NEAR, _OBSERVED))
-
-
-@wp.kernel(enable_backward=False)
-def _facing_kernel(
-    points: wp.array[wp.vec3],
-    normals: wp.array[wp.vec3],
-    centers: wp.array[wp.vec3],
-    T_camera_world: wp.array[wp.mat44],
-    pinhole: wp.array[wp.vec4],
-    image: wp.array[wp.vec3i],
-    depth: wp.array[wp.float32],
-    max_behind: float,
-    max_front: float,
-    least: float,
-    most: float,
-    facing: wp.array[wp.uint8],
-):
-    n = wp.tid()
-    for view in range(centers.shape[0]):
-        ray = centers[view] - points[n]
-        if wp.dot(normals[n], ray) > 0.0:
-            s = _signed_distance(points[n], view, T_camera_world, pinhole, image, depth, max_behind, max_front)
-            if s >= least and s < most:
-                facing[n] = wp.uint8(1)
-                break
-
-
-@wp.kernel(enable_backward=False)
-def _reach_kernel(
-    first: wp.vec3i,
-    voxel: float,
-    visible: wp.array[wp.int32],
-    T_camera_world: wp.array[wp.mat44],
-    pinhole: wp.array[wp.vec4],
-    image: wp.array[wp.vec3i],
-    deepest: wp.array[wp.float32],
-    margin: float,
-    reached: wp.array3d[wp.uint8],
-):
-    i, j, k = wp.tid()
-    p = wp.vec3(float(first[0] + i) * voxel, float(first[1] + j) * voxel, float(first[2] + k) * voxel)
-    for n in range(visible.shape[0]):
-        view = visible[n]
-        q = wp.transform_point(T_camera_world[view], p)
-        if q[2] > _NEAREST_Z and q[2] <= deepest[view]:
-            f = pinhole[view]
-            # Distance from the image's centre, both in focal lengths.
-            u = wp.abs(q[0] / q[2] - (0.5 * float(image[view][1] - 1) - f[2]) / f[0])
-            v = wp.abs(q[1] / q[2] - (0.5 * float(image[view][2] - 1) - f[3]) / f[1])
-            if u <= 0.5 * float(image[view][1]) / f[0] + margin and v <= 0.5 * float(image[view][2]) / f[1] + margin:
-                reached[i, j, k] = wp.uint8(1)
-                break
 
 
 class Evidence:
@@ -212,12 +64,14 @@ class Evidence:
         def upload(values: Any, dtype: Any) -> wp.array:
             return wp.array(values, dtype=dtype, device=self.device)
 
-        self._views = [
-            upload(self.T_camera_world.astype(np.float32), wp.mat44),
-            upload(np.array([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=np.float32), wp.vec4),
-            upload(np.array([[s, c.width, c.height] for s, c in zip(starts[:-1], cameras, strict=True)]), wp.vec3i),
-            upload(np.concatenate([view.depth.ravel() for view in views]), wp.float32),
-        ]
+        images = np.array([[s, c.width, c.height] for s, c in zip(starts[:-1], cameras, strict=True)])
+        self._views = Views()
+        self._views.T_camera_world = upload(self.T_camera_world.astype(np.float32), wp.mat44)
+        pinholes = np.array([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=np.float32)
+        self._views.pinhole = upload(pinholes, wp.vec4)
+        self._views.image = upload(images, wp.vec3i)
+        self._views.depth = upload(np.concatenate([view.depth.ravel() for view in views]), wp.float32)
+        self._views.max_behind, self._views.max_front = self.max_behind, self.max_front
 
     def visible(self, lo: np.ndarray, hi: np.ndarray, *, in_reach: bool = False) -> np.ndarray:
         """Indices (M,) int32 of the views whose frustum may hold a point of the box from `lo` to `hi` [m].
@@ -241,15 +95,13 @@ class Evidence:
         padded = tuple(n + 2 for n in shape)
         state = wp.zeros(padded, dtype=wp.uint8, device=self.device)
         wp.launch(
-            _classify_kernel,
+            classify_points,
             dim=padded,
             inputs=[
                 wp.vec3i(*(int(i) - 1 for i in start)),
                 voxel,
                 wp.array(visible, dtype=wp.int32, device=self.device),
-                *self._views,
-                self.max_behind,
-                self.max_front,
+                self._views,
                 self.behind,
                 self.band,
             ],
@@ -257,7 +109,7 @@ class Evidence:
             device=self.device,
         )
         states = state.numpy()
-        near = states == _NEAR
+        near = states == NEAR
         near = near[:-2] | near[1:-1] | near[2:]
         near = near[:, :-2] | near[:, 1:-1] | near[:, 2:]
         near = near[:, :, :-2] | near[:, :, 1:-1] | near[:, :, 2:]
@@ -267,13 +119,13 @@ class Evidence:
         """Which points of a block are in reach of one of the views `visible`; bool, `shape`."""
         reached = wp.zeros(shape, dtype=wp.uint8, device=self.device)
         wp.launch(
-            _reach_kernel,
+            find_reached,
             dim=shape,
             inputs=[
                 wp.vec3i(*(int(i) for i in start)),
                 voxel,
                 wp.array(visible, dtype=wp.int32, device=self.device),
-                *self._views[:3],
+                self._views,
                 wp.array(self.deepest, dtype=wp.float32, device=self.device),
                 REACH_MARGIN,
             ],
@@ -290,9 +142,9 @@ class Evidence:
         facing = wp.zeros(len(points), dtype=wp.uint8, device=self.device)
         vectors = [wp.array(x, dtype=wp.vec3, device=self.device) for x in (points, normals, self.centers)]
         wp.launch(
-            _facing_kernel,
+            find_facing,
             dim=len(points),
-            inputs=[*vectors, *self._views, self.max_behind, self.max_front, least, most],
+            inputs=[*vectors, self._views, least, most],
             outputs=[facing],
             device=self.device,
         )

@@ -21,7 +21,8 @@ from warpslam.runs.request import RunRequest, SequenceFacts, Source, differences
 from warpslam.runtime.cores import slice_count
 from warpslam.slam import Slam
 from warpslam.slam_state import state_arrays, state_from_arrays
-from warpslam.storage.state_file import StateFormat, read_state, sync_folder, write_state
+from warpslam.storage.atomic import sync_folder
+from warpslam.storage.state_file import StateFormat, read_state, write_state
 
 if TYPE_CHECKING:
     from warpslam.pipeline.methods import Method

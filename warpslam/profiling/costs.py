@@ -24,7 +24,7 @@ import warp as wp
 from warpslam.field.complexity import decoder_shapes, flops_per_point
 from warpslam.field.decoders import EMBEDDING_SIZE, FEATURE_SIZE, MAX_HIDDEN
 from warpslam.kernels.compositing import COUNT_STRIDE
-from warpslam.kernels.decoder import OUT_64
+from warpslam.kernels.decoder.layout import OUT_64
 
 ROW_BYTES = 4 * FEATURE_SIZE
 
@@ -47,7 +47,10 @@ NOTHING = Work()
 
 
 class Arguments:
-    """Arguments of a launch by name, either packed for the CPU (``values`` ctypes) or as they were given."""
+    """Arguments of a launch by name, fields of structs as ``argument.field``.
+
+    They are either packed for the CPU (``values`` ctypes) or as they were given.
+    """
 
     def __init__(self, kernel: wp.Kernel, values: Sequence[Any], *, readable: bool) -> None:
         self._position = _positions(kernel)
@@ -55,12 +58,12 @@ class Arguments:
 
     def number(self, name: str) -> Any:
         """A number."""
-        value = self._values[self._position[name]]
+        value = self._find(name)
         return value.value if hasattr(value, "value") else value
 
     def shape(self, name: str) -> Sequence[int]:
         """Shape of an array."""
-        return self._values[self._position[name]].shape
+        return self._find(name).shape
 
     def floats(self, name: str, first: int, stop: int) -> np.ndarray:
         """Entries ``first`` to ``stop`` of a contiguous float32 array, without a copy.
@@ -79,10 +82,17 @@ class Arguments:
         return ctypes.c_int32.from_address(self._address(name, index)).value
 
     def _address(self, name: str, index: int) -> int:
-        position = self._position[name]
+        value = self._find(name)
         if not self._readable:
             raise KeyError(name)
-        return self._values[position].data + 4 * index
+        return value.data + 4 * index
+
+    def _find(self, name: str) -> Any:
+        argument, *fields = name.split(".")
+        value = self._values[self._position[argument]]
+        for part in fields:
+            value = getattr(value, part)
+        return value
 
 
 @cache
@@ -134,7 +144,7 @@ def _forward(level: str) -> Model:
     each = flops_per_point(level)
 
     def work(threads: int, arguments: Arguments) -> Work:
-        every = arguments.number("point_count")
+        every = arguments.number("span.point_count")
         try:
             points = _points_of_going_rays(every, arguments)
         except KeyError:
@@ -146,7 +156,7 @@ def _forward(level: str) -> Model:
 
 def _points_of_going_rays(every: int, arguments: Arguments) -> int:
     """Samples on rays that are not spent yet."""
-    first, width = arguments.number("first_ray"), arguments.number("width")
+    first, width = arguments.number("span.first_ray"), arguments.number("span.width")
     transmittance = arguments.floats("transmittance", first, first + every // width)
     return int(np.count_nonzero(transmittance >= arguments.number("min_transmittance"))) * width
 
@@ -162,7 +172,7 @@ def _backward(level: str | None = None) -> Model:
         each = backward_flops(
             level or _level_of(arguments),
             points=bool(_optional(arguments, "want_point")),
-            weights=bool(_optional(arguments, "want_weights")),
+            weights=bool(_optional(arguments, "weights.wanted")),
         )
         return _listed(each, threads, arguments)
 
@@ -172,7 +182,7 @@ def _backward(level: str | None = None) -> Model:
 def _listed(each: int, threads: int, arguments: Arguments) -> Work:
     """Work on the samples of a list; where its length can't be read, one a thread."""
     try:
-        points = arguments.integer("listed_count", COUNT_STRIDE * arguments.number("slot"))
+        points = arguments.integer("listed.counts", COUNT_STRIDE * arguments.number("listed.slot"))
     except KeyError:
         return Work(threads, each * threads, counted=False)
     return Work(points, each * points)
@@ -228,19 +238,17 @@ _MODELS: dict[str, Model] = {
     "color_weights": _sum_of_color_weights,
     "composite": _samples("width"),
     **{
-        name: _samples("sample_count")
+        name: _samples("rays.sample_count")
         for name in (
             "ray_variance",
-            "composite_color",
             "composite_backward",
-            "list_weighty",
-            "list_steep",
             "surface_depth",
             "collect_ray_gradients",
             "ray_derivatives",
             "ray_jacobians",
         )
     },  # fmt: skip
+    **{name: _samples("sample_count") for name in ("composite_color", "list_weighty", "list_steep")},
     "adam_rows": _adam_rows,
     "clear_moments": _rows(2),
     "transpose_color_weights": _rows(2),

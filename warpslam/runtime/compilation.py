@@ -7,7 +7,6 @@ milliseconds. Warp releases the GIL while it compiles, so on the CPU two modules
 from __future__ import annotations
 
 import importlib
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -18,14 +17,25 @@ from pathlib import Path
 import warp as wp
 
 from warpslam.errors import ConfigError
+from warpslam.runtime.cores import process_cores
 
-_STAGES = ("gauss_newton", "rays", "adam", "compositing", "losses", "grid", "frustum", "images")
+_STAGES = (
+    "rays",
+    "kernels.gauss_newton",
+    "kernels.adam",
+    "kernels.compositing",
+    "kernels.losses",
+    "kernels.grid",
+    "views",
+)
 _PYTHON_MODULES = {
-    "warpslam.decoder_cpu": "warpslam.kernels.decoder",
-    "warpslam.decoder_cuda": "warpslam.kernels.decoder",
-    "warpslam.imap_cpu": "warpslam.kernels.imap_network",
-    "warpslam.imap_cuda": "warpslam.kernels.imap_network",
+    "warpslam.rays": ("pixels", "rays", "rejection", "samples"),
+    "warpslam.views": ("frustum", "images", "seen", "visibility"),
+    **{f"warpslam.decoder_{target}": ("decoder.build",) for target in ("cpu", "cuda")},
+    **{f"warpslam.imap_{target}": ("imap_network",) for target in ("cpu", "cuda")},
 }
+"""Warp modules that hold the kernels of other Python modules of `warpslam.kernels` than the one of their name."""
+
 _WORKERS = 2
 _BINARIES = {"cpu": (".o",), "cuda": (".ptx", ".cubin")}
 
@@ -52,7 +62,7 @@ Report = Callable[[ModuleProgress], None]
 
 def module_names(target: str) -> list[str]:
     """Warp modules of a run on ``target`` "cpu" or "cuda", those that take longest to compile first."""
-    return [f"warpslam.decoder_{target}", *(f"warpslam.kernels.{stage}" for stage in _STAGES), "warpslam.meshing.views"]
+    return [f"warpslam.decoder_{target}", *(f"warpslam.{stage}" for stage in _STAGES)]
 
 
 def compile_kernels(device: wp.Device, report: Report | None = None, extra: Sequence[str] = ()) -> list[ModuleProgress]:
@@ -73,8 +83,7 @@ def compile_kernels(device: wp.Device, report: Report | None = None, extra: Sequ
         wp.force_load(device, [module], max_workers=0)
 
     names = [*module_names(target), *extra]
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return _each(names, target, load, report, 1 if device.is_cuda else min(cores, _WORKERS))
+    return _each(names, target, load, report, 1 if device.is_cuda else min(len(process_cores()), _WORKERS))
 
 
 def compile_for_architecture(
@@ -138,8 +147,9 @@ def _each(
 
 
 def find_module(name: str) -> wp.Module:
-    """A Warp module by name, importing the Python module that builds it."""
-    importlib.import_module(_PYTHON_MODULES.get(name, name))
+    """A Warp module by name, importing the Python modules that its kernels are in."""
+    for part in _PYTHON_MODULES.get(name, ()) or (name,):
+        importlib.import_module(f"warpslam.kernels.{part}" if name in _PYTHON_MODULES else part)
     return wp.get_module(name)
 
 

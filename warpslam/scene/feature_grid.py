@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from warpslam.kernels import grid as grid_kernels
-from warpslam.kernels.grid import Lattice, Vec32
+from warpslam.kernels.grid import Lattice, Level, Vec32
 
 LEVELS = ("coarse", "middle", "fine", "color")
 
@@ -66,7 +66,8 @@ class FeatureGrid:
         return True
 
     def _resize(self, first: np.ndarray, shape: tuple[int, int, int]) -> None:
-        old_lattice, old_features, old_seen = self.lattice, self.features, self.seen
+        old, old_seen = Level(), self.seen
+        old.lattice, old.features = self.lattice, self.features
         shift = self.first - first
         self.first, self.shape = first, shape
         self.lattice = self._lattice()
@@ -76,7 +77,7 @@ class FeatureGrid:
             grid_kernels.fill_grid,
             dim=shape,
             inputs=[self.lattice, wp.vec3i(*first), self.seed, LEVELS.index(self.level), self.std]
-            + [old_lattice, old_features, old_seen, wp.vec3i(*shift)],
+            + [old, old_seen, wp.vec3i(*shift)],
             outputs=[self.features, self.seen],
             device=self.device,
             record_tape=False,

@@ -7,8 +7,9 @@ import warp as wp
 
 from warpslam.field.arrays import GridGradient, gradient_buffers
 from warpslam.field.packing import PackedDecoder
-from warpslam.kernels import adam, decoder
-from warpslam.kernels.decoder import decoders_for
+from warpslam.kernels import adam
+from warpslam.kernels.decoder.build import decoders_for
+from warpslam.kernels.decoder.layout import COLOR_WEIGHT_ROWS
 from warpslam.kernels.grid import Vec32
 from warpslam.runtime.launching import Launcher, Step
 from warpslam.scene.feature_grid import FeatureGrid
@@ -73,7 +74,7 @@ class ColorDecoderOptimizer(RowOptimizer):
 
     def begin(self) -> None:
         """Start a call: all rows change."""
-        self.start(decoder.COLOR_WEIGHT_ROWS, np.arange(decoder.COLOR_WEIGHT_ROWS))
+        self.start(COLOR_WEIGHT_ROWS, np.arange(COLOR_WEIGHT_ROWS))
 
     def update_decoder(self, packed: PackedDecoder, learning_rate: float) -> None:
         """One step on the packed weights."""

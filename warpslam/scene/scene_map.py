@@ -13,6 +13,7 @@ from warpslam.errors import InputError, MapSizeError
 from warpslam.field.arrays import FieldArrays
 from warpslam.field.decoders import Decoders
 from warpslam.field.packing import PackedDecoder
+from warpslam.field.passes import query
 from warpslam.field.ray_batch import RayBatch
 from warpslam.runtime.cores import slice_count
 from warpslam.runtime.environment import free_gigabytes
@@ -179,7 +180,7 @@ class SceneMap:
         for start in range(0, len(points), QUERY_CHUNK):
             chunk = points[start : start + QUERY_CHUNK]
             batch.set_points(chunk)
-            batch.query(arrays, stage)
+            query(batch, arrays, stage)
             values = batch.color if stage == "color" else batch.logit
             parts.append(values.numpy()[: len(chunk)].copy())
         if not parts:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpslam.camera import Intrinsics
+from warpslam.poses import rotation_angles
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -57,9 +58,7 @@ def moving_pairs(poses: np.ndarray, count: int) -> list[tuple[int, int]]:
         if not known[first]:
             continue
         later = np.flatnonzero(known[first + 1 :]) + first + 1
-        rotations = poses[later, :3, :3]
-        trace = np.einsum("nij,ij->n", rotations, poses[first, :3, :3])
-        angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+        angle = rotation_angles(poses[first, :3, :3].T @ poses[later, :3, :3])
         shift = np.linalg.norm(poses[later, :3, 3] - poses[first, :3, 3], axis=1)
         enough = later[((angle > _MIN_ANGLE) | (shift > _MIN_SHIFT)) & (angle < _MAX_ANGLE)]
         if len(enough):

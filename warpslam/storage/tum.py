@@ -8,6 +8,7 @@ import numpy as np
 
 from warpslam.errors import DatasetError
 from warpslam.poses import pose_from_vector, vector_from_pose
+from warpslam.storage.atomic import replacing
 
 
 def associate(times: np.ndarray, candidates: np.ndarray, max_difference: float = 0.02) -> np.ndarray:
@@ -47,7 +48,8 @@ def write_tum(path: str | Path, timestamps: np.ndarray, poses: np.ndarray) -> No
             # Adding zero turns -0.0, whose sign depends on the order of operations, into 0.0.
             numbers = " ".join(f"{round(x, 9) + 0.0:.9f}" for x in (tx, ty, tz, qx, qy, qz, qw))
             lines.append(f"{np.format_float_positional(time, trim='0')} {numbers}")
-    Path(path).write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
+    with replacing(Path(path)) as partial:
+        partial.write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
 
 
 def read_tum(path: str | Path) -> tuple[np.ndarray, np.ndarray]:

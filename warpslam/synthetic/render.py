@@ -127,6 +127,8 @@ class MeshRenderer:
         """
         import warp as wp  # rooms and paths, which the package brings too, need none of it
 
+        from warpslam.kernels.raycast import TexturedMesh
+
         direction = np.asarray(light, dtype=np.float64)
         if direction.shape != (3,) or not np.linalg.norm(direction) > 0:
             raise ConfigError(f"light = {light!r} must be a direction of three numbers, not zero")
@@ -143,15 +145,15 @@ class MeshRenderer:
         with wp.ScopedDevice(self._device):
             faces = wp.array(triangles.faces.ravel(), dtype=wp.int32)
             self._mesh = wp.Mesh(wp.array(triangles.vertices, dtype=wp.vec3), faces)
-            self._surface = [
-                faces,
-                wp.array(triangles.colors, dtype=wp.vec3),
-                wp.array(triangles.uvs, dtype=wp.vec2),
-                wp.array(shade.astype(np.float32), dtype=wp.float32),
-                wp.array(triangles.material, dtype=wp.int32),
-                wp.array(np.array(table, dtype=np.int32), dtype=wp.vec3i),
-                wp.array(np.concatenate(texels), dtype=wp.vec3ub),
-            ]
+            self._surface = TexturedMesh()
+            self._surface.mesh = self._mesh.id
+            self._surface.faces = faces
+            self._surface.colors = wp.array(triangles.colors, dtype=wp.vec3)
+            self._surface.uvs = wp.array(triangles.uvs, dtype=wp.vec2)
+            self._surface.shade = wp.array(shade.astype(np.float32), dtype=wp.float32)
+            self._surface.material = wp.array(triangles.material, dtype=wp.int32)
+            self._surface.textures = wp.array(np.array(table, dtype=np.int32), dtype=wp.vec3i)
+            self._surface.texels = wp.array(np.concatenate(texels), dtype=wp.vec3ub)
             shape = (intrinsics.height, intrinsics.width)
             self._rgb = wp.empty(shape, dtype=wp.vec3ub)
             self._depth = wp.empty(shape, dtype=wp.float32)
@@ -176,12 +178,9 @@ class MeshRenderer:
             render_mesh,
             dim=(k.height, k.width),
             inputs=[
-                self._mesh.id,
-                *self._surface,
-                k.fx,
-                k.fy,
-                k.cx,
-                k.cy,
+                self._surface,
+                wp.vec2(k.fx, k.fy),
+                wp.vec2(k.cx, k.cy),
                 wp.mat33(*T[:3, :3].ravel().tolist()),
                 wp.vec3(*T[:3, 3].tolist()),
                 self.max_depth,

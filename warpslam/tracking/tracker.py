@@ -11,6 +11,8 @@ import warp as wp
 from warpslam.camera import Intrinsics
 from warpslam.config import SamplingConfig, TrackingConfig
 from warpslam.field.arrays import FieldArrays, Gradients, Thresholds
+from warpslam.field.objectives import choose_inliers, gauss_newton_step, tracking_loss
+from warpslam.field.passes import render
 from warpslam.field.ray_batch import RayBatch
 from warpslam.field.seeds import ray_seed
 from warpslam.kernels import adam
@@ -107,7 +109,7 @@ class Tracker:
         """The paper's optimiser: a step of Adam on the pose vector."""
         with self._launcher.tape() as tape:
             self._render(batch, arrays, images, tape)
-            batch.tracking_loss(self.config.color_weight)
+            tracking_loss(batch, self.config.color_weight)
         self._launcher.call(partial(tape.backward, batch.loss))
         self._poses.update()
 
@@ -116,7 +118,7 @@ class Tracker:
         mean of its channels.
         """
         self._render(batch, arrays, images)
-        batch.gauss_newton_step(arrays, self._poses.poses, self.config.color_weight, thresholds=self._thresholds)
+        gauss_newton_step(batch, arrays, self._poses.poses, self.config.color_weight, thresholds=self._thresholds)
 
     def explained_share(self, known_error: float) -> float:
         """Share of the last judged pixels whose rendered depth is within ``known_error`` x D (information gain, Sec.
@@ -139,7 +141,7 @@ class Tracker:
 
         def judge() -> None:
             self._render(batch, arrays, images)
-            batch.tracking_loss(self.config.color_weight)
+            tracking_loss(batch, self.config.color_weight)
 
         uses = (self.config.color_weight, *self._uses(batch, arrays), *images.arrays)
         self._launcher.iterate("judge", uses, judge)
@@ -170,8 +172,8 @@ class Tracker:
             batch.drop_unseen(arrays)
         batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)
         gradients = None if tape is None else Gradients(points=True)
-        batch.render(arrays, "color", gradients, tape, thresholds=self._thresholds)
-        batch.choose_inliers(config.dynamic_filter, median_includes_missing=config.median_includes_missing)
+        render(batch, arrays, "color", gradients, tape, thresholds=self._thresholds)
+        choose_inliers(batch, config.dynamic_filter, median_includes_missing=config.median_includes_missing)
 
     def _uses(self, batch: RayBatch, arrays: FieldArrays) -> tuple:
         """What a recorded iteration stands on."""

@@ -1,0 +1,40 @@
+"""The kernels of all decoders, built for the CPU and for CUDA."""
+
+from types import SimpleNamespace
+
+import warp as wp
+
+from warpslam.kernels.decoder.blocks import Build
+from warpslam.kernels.decoder.coarse import coarse_kernels
+from warpslam.kernels.decoder.color import color_kernels
+from warpslam.kernels.decoder.geometry import geometry_kernels
+from warpslam.kernels.decoder.layout import WEIGHT_GROUP
+
+
+def decoder_kernels(target: str) -> SimpleNamespace:
+    """Kernels of all decoders for ``target`` "cpu" or "cuda", in the Warp module ``warpslam.decoder_<target>``.
+
+    A launch over N samples has `thread_count(N)` threads and takes N as `Span.point_count`; one over a list of up to N
+    samples has as many.
+    """
+    build = Build(target)
+    return SimpleNamespace(
+        **geometry_kernels(build),
+        **color_kernels(build),
+        **coarse_kernels(build),
+        # Blocks of a thread of `color_backward`.
+        color_blocks=WEIGHT_GROUP // build.size if build.on_cpu else 1,
+        # Threads of a launch over so many samples, one block each.
+        thread_count=lambda point_count: -(-point_count // build.size),
+        # Whether `color_backward` leaves the sum of the weight gradient to `color_weights`.
+        sums_weights_apart=not build.on_cpu,
+    )
+
+
+CPU = decoder_kernels("cpu")
+CUDA = decoder_kernels("cuda")
+
+
+def decoders_for(device: wp.Device) -> SimpleNamespace:
+    """The decoder kernels built for this kind of device."""
+    return CUDA if device.is_cuda else CPU

@@ -1,0 +1,92 @@
+"""Where the weights of a decoder lie among its rows of 32, and the structs that hand them to the kernels."""
+
+import warp as wp
+
+from warpslam.kernels.grid import Vec32
+
+# Rows of the packed weights of a decoder with coordinates (`warpslam.field.packing` packs them).
+B = 0  # 3 chunks x 3 axes
+E0 = 9  # embedding -> layer 0, 96 rows (93 used)
+E3 = 105  # embedding -> layer 3
+W1 = 201
+W2 = 233
+W3 = 265
+W4 = 297
+BIAS = 329  # b_0..b_4
+FC_BIAS = 334  # d_0..d_4
+V = 339  # V_0..V_4, 32 rows each (fine: 64)
+OUT_32 = V + 160  # output weights, then one row of output biases
+OUT_64 = V + 320
+
+# Rows of the transposed weights.
+E0_T = 0
+E3_T = 96
+W1_T = 192
+W2_T = 224
+W3_T = 256
+W4_T = 288
+V_T = 320  # V_k^T, only the part of the level's own feature
+
+# Rows of the packed and of the transposed weights of the coarse decoder.
+C_W0 = 0
+C_W1 = 32
+C_W2 = 64
+C_C3 = 96
+C_W3 = 128
+C_W4 = 160
+C_BIAS = 192
+C_OUT = 197
+
+COLOR_WEIGHT_ROWS = OUT_32 + 4
+MASK_WORDS = 5
+
+BLOCK_SIZE = {"cpu": 4, "cuda": 1}
+"""Samples of a block."""
+
+WEIGHT_GROUP = 16
+"""Samples that a CPU thread of `color_backward` sums weight gradients over before it adds them to memory."""
+
+WEIGHT_GROUP_COLUMNS = 18
+"""Vectors that each of them stores for that."""
+
+
+@wp.struct
+class Weights:
+    """A decoder: packed rows, rows of the transposed matrices, and for each sample which ReLUs let through, a bit each.
+
+    The bits are what forward leaves for the adjoint, (samples, `MASK_WORDS`).
+    """
+
+    W: wp.array[Vec32]
+    T: wp.array[Vec32]
+    bits: wp.array2d[wp.uint32]
+
+
+@wp.struct
+class RowGradient:
+    """Gradient of a grid: whether it is wanted, which rows are selected, and the buffers (slices, rows) it goes to."""
+
+    wanted: int
+    selected: wp.array[wp.uint8]
+    rows: wp.array2d[Vec32]
+
+
+@wp.struct
+class WeightGradient:
+    """Gradient of the colour decoder's weights, and what the samples store for it.
+
+    wanted: Whether it is.
+    rows: The buffers (slices, `COLOR_WEIGHT_ROWS`) it goes to.
+    activations: h_0..h_4 of each sample, which forward stores.
+    layer_grad: On the CPU a slice has the rows of one group, with a_0..a_4, g_0..g_4, the embedding (3 columns), the
+        feature and h_0..h_3 of its samples: the gradient of the weights is twice as large as a CPU's first cache, so
+        that a row of it is fetched once a group and not once a block. On CUDA thousands of threads would queue for the
+        same rows: all samples store (a_0..a_4, g_0..g_4, those of the angles, the feature), and `color_weights` sums.
+    layer_inputs: The same memory, one number an element (CPU).
+    """
+
+    wanted: int
+    rows: wp.array2d[Vec32]
+    activations: wp.array2d[Vec32]
+    layer_grad: wp.array2d[Vec32]
+    layer_inputs: wp.array3d[float]
