@@ -59,9 +59,7 @@ def trajectory_of(slam: Method, record: RunRecord) -> Trajectory:
 
 def write_trajectory(folder: RunFolder, trajectory: Trajectory, record: RunRecord) -> None:
     """Write the poses, and the true ones where there are any."""
-    partial = folder.trajectory.with_name("trajectory.tum.partial")
-    write_tum(partial, trajectory.timestamps, trajectory.poses)
-    partial.replace(folder.trajectory)
+    write_tum(folder.trajectory, trajectory.timestamps, trajectory.poses)
     if record.has_truth:
         write_tum(folder.ground_truth, trajectory.timestamps, record.truth)
 
