@@ -138,7 +138,6 @@ class Memory(_Part):
     seen_bytes: int | None = Field(None, description="what mapped frames saw, for the mesh [bytes]")
     state_bytes: int | None = Field(None, description="sum of the three [bytes]")
     image_slot_bytes: int | None = Field(None, description="images on the device, which come and go [bytes]")
-    observed_m3: Number = Field(None, description="as observed_volume_m3 [m^3]")
     state_bytes_per_observed_m3: Number = Field(None, description="state per observed volume [bytes/m^3]")
 
 

@@ -160,6 +160,8 @@ class RunRecord:
         record = cls(left_out=[LeftOut(**frame) for frame in content["left_out"]])
         truth = np.full((len(poses), 4, 4), np.nan) if truth is None else truth
         for position, (row, pose, true_pose) in enumerate(zip(content["frames"], poses, truth, strict=True)):
+            # Early files have no depth error.
+            row = {"depth_error": None, **row}
             values = {name: _known(row[name]) for name in _ROW_FIELDS}
             values["status"] = _STATUSES.get(row["status"], row["status"])
             values["losses"] = {name: _known(value) for name, value in row["losses"].items()}
