@@ -17,7 +17,6 @@ from warpslam.runtime.launching import Step
 from warpslam.runtime.program import run_slices
 
 
-
 def query(batch: RayBatch, arrays: FieldArrays, stage: str) -> None:
     """Logit (and colour, in the colour stage) of every sample: `RayBatch.logit`, `RayBatch.color`."""
 
