@@ -5,13 +5,18 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
 
 from warpslam.camera import Intrinsics
+from warpslam.config import Config
 from warpslam.errors import DatasetError, MeshError
+from warpslam.pipeline import run as pipeline
 from warpslam.poses import pose_from_vector
+from warpslam.runs.record import RunResult
+from warpslam.runs.request import RunRequest
 from warpslam.sequences.base import Frame, RgbdSequence
 
 CAMERA = Intrinsics(20, 20, 15.5, 11.5, 32, 24)
@@ -153,3 +158,12 @@ def wall() -> trimesh.Trimesh:
     """The wall that the first camera sees."""
     corners = np.array([[-3, -3, 2.2], [3, -3, 2.2], [3, 3, 2.2], [-3, 3, 2.2]])
     return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+
+
+def run_sequence(
+    sequence: RgbdSequence, config: Config, output: Path, *, frames: tuple | None = None, **asked: Any
+) -> RunResult:
+    """A run over a sequence that is at hand: arguments of `warpslam.pipeline.run.run`, and fields of its request."""
+    keywords = {name: asked.pop(name) for name in ("truth_mesh", "observer", "check_input") if name in asked}
+    request = RunRequest(config=config, frames=frames or (None, None, None), **asked)
+    return pipeline.run(request, output, sequence=sequence, **keywords)

@@ -1,8 +1,4 @@
-"""Pinhole camera and camera poses.
-
-Axes are OpenCV's: x right, y down, z forward. ``T_world_camera`` maps camera points to world points. Lengths are
-metres.
-"""
+"""Pinhole camera. Axes are OpenCV's: x right, y down, z forward. Lengths are metres."""
 
 from __future__ import annotations
 
@@ -18,11 +14,17 @@ class Intrinsics:
     """Pinhole intrinsics in pixels; pixel centres lie at integer coordinates, as in the authors' released code."""
 
     fx: float
+    """Focal length along a row [px]."""
     fy: float
+    """Focal length along a column [px]."""
     cx: float
+    """Column of the principal point [px]."""
     cy: float
+    """Row of the principal point [px]."""
     width: int
+    """Columns of the image."""
     height: int
+    """Rows of the image."""
 
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "width", "height"):
@@ -37,6 +39,18 @@ class Intrinsics:
     def matrix(self) -> np.ndarray:
         """Camera matrix K, shape (3, 3), float64."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def backproject(self, u: np.ndarray, v: np.ndarray, z: np.ndarray | float) -> np.ndarray:
+        """Points [m] in the camera's frame of columns, rows and z-depths [m] of one shape (...), shape (..., 3).
+
+        With z = 1 these are the rays of the pixels.
+        """
+        x, y = (u - self.cx) / self.fx * z, (v - self.cy) / self.fy * z
+        return np.stack([x, y, np.broadcast_to(z, x.shape)], axis=-1)
+
+    def project(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Column and row [px] of points [m] in the camera's frame, given by coordinate; z must not be 0."""
+        return self.fx * x / z + self.cx, self.fy * y / z + self.cy
 
     def scaled(self, width: int, height: int) -> Intrinsics:
         """Intrinsics of the same camera after resizing the image to ``width`` x ``height`` pixels."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.fakes import run_sequence
 from warpslam.baselines.imap import Imap
 from warpslam.camera import Intrinsics
 from warpslam.config import PRESETS, Config
 from warpslam.errors import CheckpointError, ConfigError, InputError
 from warpslam.evaluation import psnr
-from warpslam.pipeline import run as pipeline
 from warpslam.pipeline.finished import extract_mesh
 from warpslam.pipeline.setup import load_slam
 from warpslam.runs.folder import RunFolder
@@ -178,10 +178,10 @@ def test_a_run_writes_its_folder(tmp_path):
 
     sequence = SyntheticSequence(0, 2, intrinsics=CAMERA.strided(2))
     config = Config.from_preset(overrides=[*SMALL, "imap.first_iterations=5", "imap.rounds=1", "meshing.voxel=0.2"])
-    result = pipeline.run(sequence, config, tmp_path, method="imap", device="cpu")
-    assert result.status == "finished" and result.metrics["method"] == "imap"
-    assert result.metrics["map"] == {"bytes": 890_988, "flops_per_point": 443_908}
-    assert result.ate is not None and "depth_l1_m" in result.metrics["rendering"]
+    result = run_sequence(sequence, config, tmp_path, method="imap", device="cpu")
+    assert result.status == "finished" and result.metrics.method == "imap"
+    assert result.metrics.to_dict()["map"] == {"bytes": 890_988, "flops_per_point": 443_908}
+    assert result.ate is not None and result.metrics.rendering.depth_l1_m > 0
     folder = RunFolder.open(tmp_path)
     loaded = load_slam(folder)
     assert isinstance(loaded, Imap) and len(loaded.trajectory.poses) == 2

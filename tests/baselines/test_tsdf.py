@@ -7,11 +7,11 @@ import sys
 import numpy as np
 import pytest
 
+from tests.fakes import run_sequence
 from warpslam.baselines.tsdf import BLOCK_VOXELS, Tsdf, import_open3d
 from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.errors import CheckpointError, ConfigError, InputError, MeshError, MissingDependencyError
-from warpslam.pipeline import run as pipeline
 from warpslam.pipeline.finished import extract_mesh
 from warpslam.pipeline.setup import load_slam
 from warpslam.poses import pose_from_vector
@@ -147,17 +147,17 @@ def test_a_run_with_the_poses_of_an_earlier_one(tmp_path):
 
     sequence = SyntheticSequence(0, 6, intrinsics=Intrinsics(62.5, 62.5, 39.5, 29.5, 80, 60))
     config = Config.from_preset(overrides=["tracking.ignore_edge_u=2", "tracking.ignore_edge_v=2"])
-    result = pipeline.run(sequence, config, tmp_path / "a", method="tsdf", truth_mesh=sequence.mesh)
-    assert result.status == "finished" and result.metrics["method"] == "tsdf"
+    result = run_sequence(sequence, config, tmp_path / "a", method="tsdf", truth_mesh=sequence.mesh)
+    assert result.status == "finished" and result.metrics.method == "tsdf"
     assert result.ate.rmse < 1e-9 and result.reconstruction.accuracy < 0.05
-    assert result.metrics["map"]["bytes"] > 1e6 and result.metrics["map"]["flops_per_point"] is None
-    assert result.metrics["rendering"]["psnr_db"] > 15
+    assert result.metrics.map.bytes > 1e6 and result.metrics.map.flops_per_point is None
+    assert result.metrics.rendering.psnr_db > 15
     # The second run gets poses 10 cm off, and none for the last two frames.
     times, poses = read_tum(result.folder.trajectory)
     poses[:, 0, 3] += 0.1
     write_tum(tmp_path / "given.tum", times[:4], poses[:4])
-    shifted = pipeline.run(sequence, config, tmp_path / "b", method="tsdf", poses=tmp_path / "given.tum")
-    assert shifted.metrics["frames"]["processed"] == 4 and shifted.metrics["frames"]["unreadable"] == 2
+    shifted = run_sequence(sequence, config, tmp_path / "b", method="tsdf", poses=str(tmp_path / "given.tum"))
+    assert shifted.metrics.frames.processed == 4 and shifted.metrics.frames.unreadable == 2
     assert read_json(shifted.folder.metrics)["ate_m"]["unaligned"]["rmse"] == pytest.approx(0.1, abs=1e-6)
     folder = RunFolder.open(tmp_path / "b")
     loaded = load_slam(folder)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 import signal
 import sys
@@ -23,11 +24,13 @@ from warpslam.batch.local import run_batch, split_cores
 from warpslam.batch.manifest import FIELDS, read_manifest
 from warpslam.batch.status import BatchState, JobStatus
 from warpslam.batch.summary import write_summary
+from warpslam.config import Config
 from warpslam.errors import ConfigError, WarpSlamError
+from warpslam.runs.request import RunRequest, Source
 from warpslam.runtime.environment import resident_bytes
 from warpslam.storage.json_files import read_json
 
-COMMON = Job(name="", path="")
+COMMON = Job("", RunRequest(source=Source("")))
 
 
 @pytest.fixture(autouse=True)
@@ -38,7 +41,7 @@ def fake_worker(monkeypatch):
 
 
 def jobs(*names: str) -> list[Job]:
-    return with_free_names(Job(name=name, path=f"/data/{name}") for name in names)
+    return with_free_names(Job(name, RunRequest(source=Source(f"/data/{name}"))) for name in names)
 
 
 def test_failures_do_not_stop_the_rest(tmp_path):
@@ -63,7 +66,7 @@ def test_running_again_does_only_what_is_left(tmp_path):
     first = jobs("good", "broken", "other")
     run_batch(first, tmp_path, workers=2)
     before = {job.name: read_json(tmp_path / job.name / "batch.json") for job in first}
-    again = [first[0], first[1], replace(first[2], seed=1)]
+    again = [first[0], first[1], first[2].asking(seed=1)]
     statuses = run_batch(again, tmp_path)
     assert [status.status for status in statuses] == ["done before", "failed", "finished"]
     assert statuses[0].ate_rmse == 0.03
@@ -94,7 +97,7 @@ def test_workers_share_the_cores(tmp_path, monkeypatch):
     own = sorted(os.sched_getaffinity(0))
     shares = [eval((tmp_path / name / "cores.txt").read_text()) for name in ("slow1", "slow2")]
     assert sorted(sum(shares, [])) == own if len(own) > 1 else shares == [own, own]
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 4, 5, 6})
+    monkeypatch.setattr("warpslam.batch.local.process_cores", lambda: [0, 1, 4, 5, 6])
     assert split_cores(2) == [[0, 1], [4, 5, 6]]
     assert split_cores(5) == [[0], [1], [4], [5], [6]]
     assert split_cores(6)[5] == [0]
@@ -166,9 +169,10 @@ def test_manifest(tmp_path):
     file.write_text(text)
     first, second, third = with_free_names(read_manifest(file, COMMON))
     assert (first.name, second.name, third.name) == ("room", "room_2", "last_one")
-    assert first.path == str(tmp_path / "room") and third.path == "/x/y"
-    assert second.overrides == ("mapping.every=2", "mapping.window=4") and second.frames == (0, 200, None)
-    assert second.truth_mesh == str(tmp_path / "a" / "m.ply") and (second.seed, second.preset) == (3, "replica")
+    assert first.request.source.path == str(tmp_path / "room") and third.request.source.path == "/x/y"
+    asked = second.request
+    assert asked.overrides == ("mapping.every=2", "mapping.window=4") and asked.frames == (0, 200, None)
+    assert asked.truth_mesh == str(tmp_path / "a" / "m.ply") and (asked.seed, asked.preset) == (3, "replica")
     assert len({job.settings_hash for job in (first, second, third)}) == 3
     assert Job.from_dict(second.to_dict()) == second
 
@@ -180,16 +184,35 @@ def test_manifest_names_methods_poses_and_checkpoints(tmp_path):
     sequences: [a, {path: b, method: nice-slam, checkpoint_every: 0}]
     """
     (tmp_path / "m.yaml").write_text(text)
-    first, second = read_manifest(tmp_path / "m.yaml", replace(COMMON, checkpoint_every=50))
+    jobs = read_manifest(tmp_path / "m.yaml", COMMON.asking(checkpoint_every=50))
+    first, second = (job.request for job in jobs)
     assert (first.method, first.poses, first.checkpoint_every) == ("tsdf", str(tmp_path / "poses.tum"), 7)
     assert (second.method, second.checkpoint_every) == ("nice-slam", None)
 
 
+def test_manifest_takes_settings_from_files(tmp_path):
+    """A config stands in place of a preset that is given for all, and the other way round, but not beside one."""
+    Config.from_preset("thorough", ["mapping.window=3"]).save(tmp_path / "c.yaml")
+    text = """
+    defaults: {config: c.yaml}
+    sequences: [a, {path: b, preset: replica}, {path: c, map: m.safetensors, localize_only: true}]
+    """
+    (tmp_path / "m.yaml").write_text(text)
+    jobs = read_manifest(tmp_path / "m.yaml", COMMON.asking(preset="icl"))
+    first, second, third = (job.request for job in jobs)
+    assert (first.config.mapping.window, first.preset) == (3, None)
+    assert (second.config, second.preset) == (None, "replica")
+    assert (third.map, third.localize_only) == (str(tmp_path / "m.safetensors"), True)
+    assert Job.from_dict(json.loads(json.dumps(jobs[0].to_dict()))) == jobs[0]
+    other = replace(jobs[0], request=replace(first, config=first.config.updated(["mapping.window=4"])))
+    assert other.settings_hash != jobs[0].settings_hash, "what is in the file decides, not its name"
+
+
 def test_checkpoints_do_not_decide_on_the_result():
     """A batch with other checkpoints is still the same batch; one with another method or other poses is not."""
-    job = Job("a", "/a")
-    assert replace(job, checkpoint_every=5).settings_hash == job.settings_hash
-    assert len({j.settings_hash for j in (job, replace(job, method="tsdf"), replace(job, poses="/p"))}) == 3
+    job = Job("a", RunRequest(source=Source("/a")))
+    assert job.asking(checkpoint_every=5).settings_hash == job.settings_hash
+    assert len({j.settings_hash for j in (job, job.asking(method="tsdf"), job.asking(poses="/p"))}) == 3
 
 
 @pytest.mark.parametrize(
@@ -204,6 +227,9 @@ def test_checkpoints_do_not_decide_on_the_result():
         ("sequences: [{path: b, set: a=1}]", "set = 'a=1' must be a list"),
         ("sequences:\n- path: b\n  frames: 1:20", "frames = 80 must be a text in quotes"),
         ("sequences: [{path: b, frames: 'x'}]", "is not A:B"),
+        ("sequences: [{path: b, config: none.yaml}]", "none.yaml: can't be read"),
+        ("sequences: [{path: b, config: c.yaml, preset: icl}]", "config and preset do not go together"),
+        ("sequences: [{path: b, localize_only: 1}]", "localize_only = 1 must be true or false"),
         ("sequences: [a]\nextra: 1", "unknown field extra"),
         ("a: b: c", "can't be read as yaml"),
         ("[" * 3000, "can't be read as yaml"),
@@ -228,7 +254,7 @@ def test_any_manifest_is_read_or_refused(tmp_path_factory, content):
     file = tmp_path_factory.mktemp("m") / "m.yaml"
     file.write_text(yaml.safe_dump(content))
     try:
-        assert all(isinstance(job.path, str) for job in with_free_names(read_manifest(file, COMMON)))
+        assert all(isinstance(job.request.source.path, str) for job in with_free_names(read_manifest(file, COMMON)))
     except WarpSlamError:
         pass
 
@@ -236,10 +262,10 @@ def test_any_manifest_is_read_or_refused(tmp_path_factory, content):
 def test_settings_are_refused_before_any_worker_starts(tmp_path):
     """A setting out of range, an unknown preset, no job at all."""
     bad = [
-        ([replace(jobs("a")[0], overrides=("mapping.window=0",))], {}, "mapping.window"),
-        ([replace(jobs("a")[0], preset="fast")], {}, "preset 'fast'"),
-        ([jobs("b")[0], replace(jobs("a")[0], method="orb")], {}, "method 'orb' is unknown"),
-        ([replace(jobs("a")[0], checkpoint_every=-1)], {}, "checkpoint_every = -1 of a"),
+        ([jobs("a")[0].asking(overrides=("mapping.window=0",))], {}, "mapping.window"),
+        ([jobs("a")[0].asking(preset="fast")], {}, "preset 'fast'"),
+        ([jobs("b")[0], jobs("a")[0].asking(method="orb")], {}, "method 'orb' is unknown"),
+        ([jobs("a")[0].asking(checkpoint_every=-1)], {}, "checkpoint_every = -1 of a"),
         ([], {}, "the batch is empty"),
         (jobs("a"), {"workers": 0}, "workers = 0"),
         (jobs("a"), {"memory_gb": 0.0}, "memory_gb"),
@@ -294,7 +320,7 @@ def test_command_names_method_and_checkpoints(tmp_path, monkeypatch, options, me
     found = []
     monkeypatch.setattr(batch, "run_batch", lambda jobs, output, **keywords: found.extend(jobs) or [])
     assert cli.main(["batch", str(tmp_path), "-o", str(tmp_path / "out"), *options]) == 0
-    assert [(job.method, job.checkpoint_every) for job in found] == [(method, every)]
+    assert [(job.request.method, job.request.checkpoint_every) for job in found] == [(method, every)]
 
 
 def test_table_on_a_terminal(tmp_path, monkeypatch):
@@ -310,7 +336,6 @@ def test_table_on_a_terminal(tmp_path, monkeypatch):
 
 def test_dead_coordinator_takes_its_workers_along(tmp_path):
     """A worker whose reader is gone ends instead of going on unseen."""
-    import json
     import subprocess
 
     (job,) = jobs("slow")

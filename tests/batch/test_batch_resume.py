@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.pipeline.test_resume import CAMERA, FRAMES, SAME, SETTINGS
+from warpslam.batch import jobs as batch_jobs
 from warpslam.batch import local as batch
 from warpslam.batch.jobs import Job
 from warpslam.batch.local import run_batch
@@ -18,9 +19,9 @@ from warpslam.batch.worker import execute
 from warpslam.pipeline import checkpoints as resume
 from warpslam.pipeline import run as pipeline
 from warpslam.pipeline.checkpoints import read_checkpoint
-from warpslam.pipeline.finished import open_source
+from warpslam.pipeline.setup import open_source
 from warpslam.runs.folder import RunFolder
-from warpslam.runs.request import Source
+from warpslam.runs.request import RunRequest, Source
 from warpslam.storage.json_files import read_json
 from warpslam.synthetic import SyntheticSequence, write_replica
 
@@ -31,8 +32,9 @@ NAME = "room"
 def no_plots():
     """Figures and the report take longer than all else here and have no part in it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline._Run, "_draw_plots", lambda self: None)
-        patch.setattr(pipeline._Run, "_write_report", lambda self: None)
+        patch.setattr(pipeline, "draw_plots", lambda *arguments: None)
+        patch.setattr(pipeline, "draw_panels", lambda *arguments: None)
+        patch.setattr(pipeline, "write_report", lambda folder: None)
         yield
 
 
@@ -41,16 +43,16 @@ def job(tmp_path_factory) -> Job:
     """A few frames on disk."""
     folder = tmp_path_factory.mktemp("recording") / NAME
     write_replica(SyntheticSequence(0, FRAMES, intrinsics=CAMERA), folder)
-    return Job(
-        NAME, str(folder), preset="default", overrides=tuple(SETTINGS), device="cpu", seed=3, checkpoint_every=2
-    )  # fmt: skip
+    source, overrides = Source(str(folder)), tuple(SETTINGS)
+    request = RunRequest(source, preset="default", overrides=overrides, device="cpu", seed=3, checkpoint_every=2)
+    return Job(NAME, request)
 
 
 @pytest.fixture(scope="module")
 def whole(job, tmp_path_factory) -> Path:
     """The batch that the others are compared with; it writes no checkpoint."""
     output = tmp_path_factory.mktemp("whole")
-    assert execute(replace(job, checkpoint_every=None), output, lambda news: None) == FINISHED
+    assert execute(job.asking(checkpoint_every=None), output, lambda news: None) == FINISHED
     return output
 
 
@@ -97,7 +99,7 @@ def test_killed_worker_goes_on_to_the_same_bytes(job, whole, tmp_path, monkeypat
 
 def test_interrupted_sequence_goes_on_to_the_same_bytes(job, stopped, whole, tmp_path):
     """After ctrl-C, and also if the batch is to write its checkpoints at other frames now."""
-    status = run_again(replace(job, checkpoint_every=7), stopped, tmp_path / "out")
+    status = run_again(job.asking(checkpoint_every=7), stopped, tmp_path / "out")
     assert (status.status, status.resumed_after, status.done) == (FINISHED, 4, FRAMES)
     assert_same(tmp_path / "out", whole)
 
@@ -106,8 +108,8 @@ def test_interrupted_sequence_goes_on_to_the_same_bytes(job, stopped, whole, tmp
 def test_other_settings_start_anew(job, stopped, tmp_path, monkeypatch, change):
     """What was computed with other settings, or by another version, is not mixed with the rest."""
     if change == "version":
-        monkeypatch.setattr(batch, "__version__", "0")
-    status = run_again(replace(job, seed=4) if change == "seed" else job, stopped, tmp_path / "out")
+        monkeypatch.setattr(batch_jobs, "__version__", "0")
+    status = run_again(job.asking(seed=4) if change == "seed" else job, stopped, tmp_path / "out")
     assert (status.status, status.resumed_after, status.done, status.message) == (FINISHED, 0, FRAMES, "")
 
 
@@ -130,10 +132,10 @@ def test_damaged_checkpoint_starts_anew(job, stopped, whole, tmp_path, caplog):
 def test_changed_input_starts_anew(job, stopped, tmp_path):
     """A frame that was replaced since: the sequence is run again as a whole, and why is in the table."""
     folder = tmp_path / NAME
-    shutil.copytree(job.path, folder)
+    shutil.copytree(job.request.source.path, folder)
     status = run_again(job, stopped, tmp_path / "kept")
     assert status.resumed_after == 4
-    first, other = (Path(job.path) / "results" / f"depth{n:06d}.png" for n in (0, 9))
+    first, other = (Path(job.request.source.path) / "results" / f"depth{n:06d}.png" for n in (0, 9))
     content = first.read_bytes()
     first.write_bytes(other.read_bytes())
     try:
@@ -145,7 +147,7 @@ def test_changed_input_starts_anew(job, stopped, tmp_path):
 
 def test_another_gpu_goes_on(job, stopped, monkeypatch):
     """Which GPU a worker gets may differ from batch to batch; from a GPU to the CPU it is another run."""
-    folder, sequence = RunFolder(stopped / NAME), open_source(Source(job.path))
+    folder, sequence = RunFolder(stopped / NAME), open_source(job.request.source)
     saved = read_checkpoint(folder)
     on_gpu = replace(saved, request=replace(saved.request, device="cuda:1"))
     monkeypatch.setattr(resume, "read_checkpoint", lambda folder: on_gpu)
@@ -160,7 +162,7 @@ def test_method_and_poses_of_a_job(job, tmp_path):
     given = tmp_path / "given.tum"
     given.write_text("".join(f"{n / 30:.6f} 0 0 {0.01 * n} 0 0 0 1\n" for n in range(FRAMES)))
     small = ("imap.first_iterations=2", "imap.iterations=1", "imap.rounds=1", "imap.refinement_rounds=0")
-    job = replace(job, method="imap", poses=str(given), overrides=(*job.overrides, *small, "meshing.voxel=0.3"))
+    job = job.asking(method="imap", poses=str(given), overrides=(*job.request.overrides, *small, "meshing.voxel=0.3"))
     assert execute(job, tmp_path, lambda news: None) == FINISHED
     folder = RunFolder(tmp_path / NAME)
     metrics = read_json(folder.metrics)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,6 +16,7 @@ from warpslam.batch.ray_cluster import run_on_ray, share_of_cluster
 from warpslam.batch.status import BatchState
 from warpslam.camera import Intrinsics
 from warpslam.errors import ConfigError
+from warpslam.runs.request import RunRequest, Source
 from warpslam.synthetic import SyntheticSequence, write_replica
 
 SMALL = (
@@ -73,9 +73,9 @@ def test_lost_worker_is_replaced(tmp_path, monkeypatch):
     jobs = []
     for seed in (1, 2):
         write_replica(SyntheticSequence(seed, 6, intrinsics=camera, device="cpu"), tmp_path / f"room{seed}")
-        job = Job(f"room{seed}", str(tmp_path / f"room{seed}"), preset="default", overrides=SMALL, device="cpu")
-        job = replace(job, checkpoint_every=2)
-        jobs.append(job)
+        source = Source(str(tmp_path / f"room{seed}"))
+        request = RunRequest(source, preset="default", overrides=SMALL, device="cpu", checkpoint_every=2)
+        jobs.append(Job(f"room{seed}", request))
     output, killed = tmp_path / "out", []
 
     def on_update(status):

@@ -15,17 +15,17 @@ from warpslam.storage.json_files import write_json
 def fake_run(job: Job, folder: Path, report, watch, slot: int) -> tuple[str, str]:
     """In place of `batch_worker._run`: ATE is 1 cm and 2 cm more a seed; iMAP fails, without colour frames are lost."""
     report({"compiled": True})
-    if job.method == "imap":
+    if job.request.method == "imap":
         raise DatasetError("depth.png: truncated")
     run = RunFolder(folder)
     run.trajectory.write_text("# timestamp tx ty tz qx qy qz qw\n")
     run.report.write_text("<!doctype html>")
-    lost = 3 if "tracking.color_weight=0" in job.overrides else 0
+    lost = 3 if "tracking.color_weight=0" in job.request.overrides else 0
     metrics = {
         "status": "finished",
         "device": "cpu",
         "frames": {"selected": 10, "processed": 10, "unreadable": 0, "LOST": lost},
-        "ate_m": {"aligned": {"rmse": 0.01 + 0.02 * job.seed + 0.1 * lost}},
+        "ate_m": {"aligned": {"rmse": 0.01 + 0.02 * job.request.seed + 0.1 * lost}},
         "versions": {"warpslam": "1"},
     }
     write_json(run.metrics, metrics)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -27,7 +26,7 @@ def test_settings_of_a_job(write_suite, tmp_path):
         device="cpu",
     )  # fmt: skip
     suite = read_suite(str(path))
-    tracked, imap, given = (entry.job for entry in expand(suite, tmp_path))
+    tracked, imap, given = (entry.job.request for entry in expand(suite, tmp_path))
     assert given.overrides == ("mapping.every=4", "mapping.iterations=30", "mapping.pixels=88")
     assert (given.poses, given.truth_mesh) == (str(tmp_path / "p.txt"), str(tmp_path / "hall.ply"))
     assert (given.frames, given.seed, given.device) == ((0, 9, None), 7, "cpu")
@@ -42,7 +41,7 @@ def test_names_and_hashes_are_stable(write_suite, tmp_path):
     jobs = unique_jobs(expand(suite, tmp_path))
     assert jobs == unique_jobs(expand(suite, tmp_path))
     assert [job.settings_hash for job in unique_jobs(expand(suite, tmp_path, ["levels"]))] == [
-        job.settings_hash for job in jobs if "tracking.use_given_poses=true" in job.overrides
+        job.settings_hash for job in jobs if "tracking.use_given_poses=true" in job.request.overrides
     ]
     assert len({job.name for job in jobs}) == len(jobs)
     assert "room-nice-slam-0a6b87d3-seed3" in {job.name for job in jobs}
@@ -71,12 +70,13 @@ def test_sequences_are_rendered_once(write_suite, tmp_path):
     entries = expand(suite, tmp_path)
     (folder,) = render_missing(suite, tmp_path, entries)
     job = entries[0].job
-    assert Path(job.path) == folder and Path(job.truth_mesh).is_file()
+    assert Path(job.request.source.path) == folder and Path(job.request.truth_mesh).is_file()
     assert read_json(folder / "rendering.json")["size"] == [24, 18]
     assert render_missing(suite, tmp_path, entries) == []
     (folder / "rendering.json").unlink()
     assert render_missing(suite, tmp_path, entries) == [folder]
     sequences["room"]["render"]["seed"] = 1
     other = expand(read_suite(str(write_suite("levels", sequences=sequences))), tmp_path)
-    assert replace(other[0].job, path="", truth_mesh=None) == replace(job, path="", truth_mesh=None)
-    assert other[0].job.path != job.path
+    elsewhere = {"source": None, "truth_mesh": None}
+    assert other[0].job.asking(**elsewhere) == job.asking(**elsewhere)
+    assert other[0].job.request.source != job.request.source

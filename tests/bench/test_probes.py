@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 
 from warpslam.batch.jobs import Job
 from warpslam.bench.probes import PROBES, convergence, measure, outside_change
 from warpslam.camera import Intrinsics
 from warpslam.errors import DatasetError
+from warpslam.runs.request import RunRequest, Source
 from warpslam.synthetic import make_sequence, write_sequence
 
 
@@ -22,13 +21,13 @@ def job(tmp_path_factory) -> Job:
         "mapping.every=1", "mapping.pixels=80", "mapping.first_iterations=20", "mapping.iterations=10",
         "mapping.coarse_iterations=2", "keyframes.every=1", "tracking.ignore_edge_u=2", "tracking.ignore_edge_v=2",
     )  # fmt: skip
-    return Job("room", str(folder), preset="default", overrides=overrides, device="cpu")
+    return Job("room", RunRequest(Source(str(folder)), preset="default", overrides=overrides, device="cpu"))
 
 
 def test_only_the_frustum_changes(job):
     """With the selection nothing outside changes, to the bit; without it something does, on every level."""
     on = outside_change(job)
-    off = outside_change(replace(job, overrides=(*job.overrides, "mapping.frustum_selection=false")))
+    off = outside_change(job.asking(overrides=(*job.request.overrides, "mapping.frustum_selection=false")))
     assert on["figures"] == {"outside": 0.0} and off["figures"]["outside"] > 0
     for level, known in on["levels"].items():
         assert known["outside"] > 0 and known["changed"] == 0 and off["levels"][level]["changed"] > 0
@@ -48,7 +47,7 @@ def test_measured_once(job, tmp_path, monkeypatch):
     monkeypatch.setitem(PROBES, "outside", lambda job: calls.append(job) or {"figures": {"outside": 0.5}})
     first, again = measure("outside", job, tmp_path), measure("outside", job, tmp_path)
     assert first == again and len(calls) == 1
-    measure("outside", replace(job, seed=1), tmp_path)
+    measure("outside", job.asking(seed=1), tmp_path)
     assert len(calls) == 2
 
 
@@ -57,4 +56,4 @@ def test_frames_without_poses(job, tmp_path):
     elsewhen = tmp_path / "elsewhen.tum"
     elsewhen.write_text("1000 0 0 0 0 0 0 1\n")
     with pytest.raises(DatasetError, match="none of the selected frames has a pose"):
-        convergence(replace(job, poses=str(elsewhen)))
+        convergence(job.asking(poses=str(elsewhen)))

@@ -29,15 +29,17 @@ def faked(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
     class Slam(FakeSlam):
         configs: list = []
 
-    def build(intrinsics, config, device, seed):
+    def build(intrinsics, config, device, seed, method):
         Slam.configs.append(config)
         return Slam(intrinsics, config=config, device=device, seed=seed)
 
     monkeypatch.setattr(pipeline, "build_slam", build)
-    monkeypatch.setattr(pipeline._Run, "_draw_plots", lambda self: None)
-    monkeypatch.setattr(pipeline._Run, "_write_report", lambda self: None)
+    monkeypatch.setattr(pipeline, "draw_plots", lambda *arguments: None)
+    monkeypatch.setattr(pipeline, "draw_panels", lambda *arguments: None)
+    monkeypatch.setattr(pipeline, "write_report", lambda folder: None)
     monkeypatch.setattr(revisit, "load_slam", lambda folder, device=None: Slam.load(folder.map, device))
-    monkeypatch.setattr(revisit, "open_source", lambda source: FakeSequence(8, unreadable=(6,)))
+    for module in (pipeline, revisit):
+        monkeypatch.setattr(module, "open_source", lambda source: FakeSequence(8, unreadable=(6,)))
     return Slam
 
 
@@ -63,6 +65,30 @@ def test_run_passes_settings_on(faked, tmp_path):
     assert (config.mapping.window, config.tracking.iterations, config.mapping.every) == (3, 7, 2)
     assert (config.tracking.pixels, config.decoders) == (1000, "some.pth")
     assert "decoders: some.pth" in (tmp_path / "config.yaml").read_text()
+
+
+@pytest.mark.parametrize("command", [["run", "seq"], ["batch", "seq"]])
+def test_settings_from_a_file(faked, tmp_path, capsys, command):
+    """A file that can't be used is named with its field; it takes the place of a preset, a map and a checkpoint."""
+    file, out = tmp_path / "c.yaml", ["-o", str(tmp_path / "out")]
+    for text, message in (
+        ("mapping: {window: 0}", "c.yaml: mapping.window"),
+        ("mapping: {windw: 3}", "c.yaml: mapping.windw"),
+        ("[]", "c.yaml: expected a mapping"),
+        ("a: b: c", "c.yaml: can't be read as yaml"),
+    ):
+        file.write_text(text)
+        assert cli.main([*command, "--config", str(file), *out]) == 2
+        assert message in capsys.readouterr().err
+    assert cli.main([*command, "--config", str(tmp_path / "none.yaml"), *out]) == 2
+    assert "none.yaml: can't be read" in capsys.readouterr().err
+    assert cli.main([*command, "--config", str(file), "--preset", "replica", *out]) == 2
+    assert "--config does not go with --preset" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    if command[0] == "run":
+        assert cli.main([*command, "--config", str(file), "--map", "m", *out]) == 2
+        assert cli.main(["run", "--resume", str(tmp_path), "--config", str(file)]) == 2
+        assert "--config does not go with --resume" in capsys.readouterr().err
 
 
 def test_run_records_how_to_open_the_input_again(faked, tmp_path):
@@ -100,11 +126,11 @@ def test_method_and_poses_are_passed_on(faked, tmp_path, capsys, monkeypatch):
     assert read_json(tmp_path / "b" / "metrics.json")["poses"] == poses
     methods = []
 
-    def build(method, intrinsics, config, device, seed):
+    def build(intrinsics, config, device, seed, method):
         methods.append(method)
         return faked(intrinsics, config=config)
 
-    monkeypatch.setattr(pipeline, "build_baseline", build)
+    monkeypatch.setattr(pipeline, "build_slam", build)
     assert cli.main(["run", "seq", "--method", "tsdf", "--frames", "0:4", "-o", str(tmp_path / "c")]) == 0
     assert methods == ["tsdf"] and read_json(tmp_path / "c" / "metrics.json")["method"] == "tsdf"
 
@@ -218,7 +244,7 @@ def test_demo_runs_on_its_own_sequence(faked, small_evaluation, tmp_path, monkey
     class Demo(FakeSequence):
         name, mesh = "demo", wall()
 
-    monkeypatch.setattr(demo, "demo_sequence", lambda: Demo(4))
+    monkeypatch.setattr(pipeline, "open_source", lambda source: Demo(4) if source.is_demo else None)
     assert cli.main(["demo", "--set", "mapping.window=4", "-o", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert "ATE RMSE" in out and "frustum+occlusion" in out

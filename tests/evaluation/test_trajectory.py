@@ -217,7 +217,7 @@ def test_damaged_tum_file_names_file_and_line(tmp_path, line: str):
     """Too few numbers, a zero quaternion, words and NaN end in a DatasetError that says where."""
     path = tmp_path / "bad.tum"
     path.write_text(f"# comment\n0 0 0 0 0 0 0 1\n{line}\n")
-    with pytest.raises(DatasetError, match=r"bad\.tum, line 3"):
+    with pytest.raises(DatasetError, match=r"bad\.tum:3: "):
         read_tum(path)
 
 

@@ -1,7 +1,6 @@
 """Schedules: mapping beside tracking gives the same kind of map, is never far behind, and hides no failure."""
 
 import dataclasses
-import os
 import threading
 import time
 
@@ -122,7 +121,7 @@ def test_tracking_goes_on_while_the_mapper_works(frames, gated):
 @pytest.mark.parametrize("optimizer", ["adam", "gauss_newton"])
 def test_mapper_and_tracker_leave_each_other_alone(frames, monkeypatch, optimizer):
     """Both at the same time, each recording its iterations anew, compute to the bit what they compute by themselves."""
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    monkeypatch.setattr("psutil.Process.cpu_affinity", lambda self: [0, 1], raising=False)
     settings = [f"tracking.optimizer={optimizer}", "mapping.bundle_adjustment_keyframes=2", "mapping.iterations=20"]
 
     def track(slam: Slam) -> np.ndarray:

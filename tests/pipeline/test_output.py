@@ -16,11 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.fakes import FakeSequence, FakeSlam
+from tests.fakes import FakeSequence, FakeSlam, run_sequence
 from warpslam import cli
 from warpslam.config import Config
 from warpslam.errors import ConfigError, DatasetError, OutputError
-from warpslam.pipeline import finished as revisit
 from warpslam.pipeline import run as pipeline
 from warpslam.runs.folder import RunFolder
 from warpslam.runtime.kernel_cache import kernel_cache_errors
@@ -42,10 +41,11 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
             return result
 
     monkeypatch.setattr(
-        pipeline, "build_slam", lambda intrinsics, config, device, seed: Slam(intrinsics, config=config)
+        pipeline, "build_slam", lambda intrinsics, config, device, seed, method: Slam(intrinsics, config=config)
     )
-    monkeypatch.setattr(pipeline._Run, "_draw_plots", lambda self: None)
-    monkeypatch.setattr(revisit, "open_source", lambda source: FakeSequence(8))
+    monkeypatch.setattr(pipeline, "draw_plots", lambda *arguments: None)
+    monkeypatch.setattr(pipeline, "draw_panels", lambda *arguments: None)
+    monkeypatch.setattr(pipeline, "open_source", lambda source: FakeSequence(8))
     return Slam
 
 
@@ -97,7 +97,7 @@ def test_disk_that_fills_up_during_the_run(fake, small_disk, monkeypatch, caplog
 
     monkeypatch.setattr(fake, "step", filling)
     with pytest.raises(OutputError, match="No space left"):
-        pipeline.run(FakeSequence(8), Config(), small_disk / "run")
+        run_sequence(FakeSequence(8), Config(), small_disk / "run")
     where = re.search(r"trajectory so far is in (\S+)", caplog.text)
     assert where is not None
     assert len(read_tum(where[1])[0]) == 8
@@ -115,7 +115,7 @@ def test_log_that_can_not_be_written_does_not_end_the_run(fake, tmp_path, monkey
             emit(self, record)
 
     monkeypatch.setattr(logging.StreamHandler, "emit", failing)
-    result = pipeline.run(FakeSequence(8), Config(), tmp_path)
+    result = run_sequence(FakeSequence(8), Config(), tmp_path)
     assert result.status == "finished" and caplog.text.count("goes on without it") == 1
     assert "Logging error" not in capsys.readouterr().err
 
@@ -189,18 +189,18 @@ class Timed(FakeSequence):
 )
 def test_times_that_do_not_go_forward(fake, tmp_path, times, kept):
     """Each wrong time costs a frame, and not all that come after it; metrics.json says which and why."""
-    result = pipeline.run(Timed([t / 30 for t in times]), Config(), tmp_path)
+    result = run_sequence(Timed([t / 30 for t in times]), Config(), tmp_path)
     np.testing.assert_allclose(read_tum(result.folder.trajectory)[0], np.array(kept) / 30)
     unusable = read_json(result.folder.metrics)["unusable_frames"]
-    assert len(unusable) == len(times) - len(kept) == result.metrics["frames"]["unreadable"]
+    assert len(unusable) == len(times) - len(kept) == result.metrics.frames.unreadable
     assert all("is not after" in entry["reason"] for entry in unusable)
 
 
 def test_skipped_and_unreadable_frames_are_listed(fake, tmp_path, monkeypatch):
     """metrics.json has a line for each frame without a result, with its number in the sequence."""
     monkeypatch.setattr(fake, "skip", (1,))
-    result = pipeline.run(FakeSequence(8, unreadable=(1,)), Config(), tmp_path, frames=slice(0, 8))
-    assert result.metrics["unusable_frames"] == [
+    result = run_sequence(FakeSequence(8, unreadable=(1,)), Config(), tmp_path, frames=(0, 8, None))
+    assert read_json(result.folder.metrics)["unusable_frames"] == [
         {"frame": 1, "status": "unreadable", "reason": "frame000001.jpg is truncated"},
         {"frame": 2, "status": "SKIPPED", "reason": "no use"},
     ]
@@ -210,16 +210,16 @@ def test_no_usable_frame_is_an_error(fake, tmp_path, monkeypatch):
     """When every frame is skipped the run says so, instead of showing an empty map."""
     monkeypatch.setattr(fake, "skip", tuple(range(8)))
     with pytest.raises(DatasetError, match="none of the 8 frames can be used: no use"):
-        pipeline.run(FakeSequence(8), Config(), tmp_path)
+        run_sequence(FakeSequence(8), Config(), tmp_path)
 
 
 def test_given_poses_with_holes(fake, tmp_path):
     """With use_given_poses a frame without a pose is skipped; a sequence without any is refused at the start."""
     config = Config.from_preset("default", ["tracking.use_given_poses=true"])
-    result = pipeline.run(FakeSequence(8, no_truth=(3,)), config, tmp_path / "a")
-    assert result.metrics["frames"]["SKIPPED"] == 1 and result.metrics["frames"]["OK"] == 7
+    result = run_sequence(FakeSequence(8, no_truth=(3,)), config, tmp_path / "a")
+    assert result.metrics.frames.SKIPPED == 1 and result.metrics.frames.OK == 7
     with pytest.raises(ConfigError, match="has no poses"):
-        pipeline.run(FakeSequence(8, no_truth=tuple(range(8))), config, tmp_path / "b")
+        run_sequence(FakeSequence(8, no_truth=tuple(range(8))), config, tmp_path / "b")
 
 
 def test_input_that_can_not_work_is_refused_before_any_work(fake, tmp_path, monkeypatch):
@@ -232,8 +232,8 @@ def test_input_that_can_not_work_is_refused_before_any_work(fake, tmp_path, monk
     build = pipeline.build_slam
     monkeypatch.setattr(pipeline, "build_slam", lambda *arguments: built.append(1) or build(*arguments))
     with pytest.raises(DatasetError, match="principal point .*--camera.*warpslam check"):
-        pipeline.run(OffCentre(4), Config(), tmp_path)
+        run_sequence(OffCentre(4), Config(), tmp_path)
     assert not built and read_json(tmp_path / "metrics.json")["status"] == "failed"
-    result = pipeline.run(OffCentre(4), Config(), tmp_path, check_input=False)
-    (finding,) = result.metrics["input_checks"]
-    assert built and finding["check"] == "camera" and json.loads((tmp_path / "metrics.json").read_text())
+    result = run_sequence(OffCentre(4), Config(), tmp_path, check_input=False)
+    (finding,) = result.metrics.input_checks
+    assert built and finding.check == "camera" and json.loads((tmp_path / "metrics.json").read_text())

@@ -11,12 +11,13 @@ import trimesh
 import yaml
 from PIL import Image
 
-from tests.fakes import FakeSequence, FakeSlam, true_pose, wall
+from tests.fakes import FakeSequence, FakeSlam, run_sequence, true_pose, wall
 from warpslam.config import Config
 from warpslam.errors import ConfigError, DatasetError, InputError, MeshError
 from warpslam.evaluation import load_mesh, psnr, ssim
 from warpslam.pipeline import finished as revisit
 from warpslam.pipeline import run as pipeline
+from warpslam.pipeline.observer import Observer
 from warpslam.report.plots import top_view_axes
 from warpslam.runs.folder import RunFolder
 from warpslam.runs.panels import load_panels
@@ -33,7 +34,7 @@ def fake_slam(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
         made: list[FakeSlam] = []
         loaded: list[FakeSlam] = []
 
-    def build(intrinsics, config, device, seed):
+    def build(intrinsics, config, device, seed, method):
         Slam.made.append(Slam(intrinsics, config=config, device=device, seed=seed))
         return Slam.made[-1]
 
@@ -43,7 +44,6 @@ def fake_slam(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
         Slam.loaded.append(Slam.load(folder.map, device))
         return Slam.loaded[-1]
 
-    monkeypatch.setattr(pipeline, "load_slam", load)
     monkeypatch.setattr(revisit, "load_slam", load)
     monkeypatch.setattr("warpslam.report.pictures.SUPERSAMPLING", 1)
     return Slam
@@ -55,7 +55,7 @@ def metrics_of(path) -> dict:
 
 def test_a_run_writes_everything(fake_slam, tmp_path):
     """Every promised file is there and readable, and the figures are those of the fake's 1 cm errors."""
-    result = pipeline.run(FakeSequence(8), Config(), tmp_path / "run", seed=3, source=Source("somewhere"))
+    result = run_sequence(FakeSequence(8), Config(), tmp_path / "run", seed=3, source=Source("somewhere"))
     folder = result.folder
     assert result.status == "finished"
     assert {file.name for file in folder.path.iterdir()} == {
@@ -65,7 +65,7 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
     }  # fmt: skip
     assert yaml.safe_load(folder.config.read_text())["mapping"]["window"] == Config().mapping.window
     metrics = metrics_of(folder.path)
-    assert metrics == json.loads(to_json(result.metrics))
+    assert metrics == json.loads(to_json(result.metrics.to_dict()))
     assert metrics["status"] == "finished" and metrics["seed"] == 3
     assert metrics["frames"] == {"selected": 8, "processed": 8, "unreadable": 0, "OK": 8, "LOST": 0, "SKIPPED": 0}
     assert metrics["ate_m"]["unaligned"]["rmse"] == pytest.approx(0.01 / np.sqrt(2))
@@ -106,14 +106,14 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
 def test_same_input_same_trajectory_bytes(fake_slam, tmp_path):
     """Two runs write the same trajectory, byte for byte."""
     for name in "ab":
-        pipeline.run(FakeSequence(4), Config(), tmp_path / name)
+        run_sequence(FakeSequence(4), Config(), tmp_path / name)
     assert (tmp_path / "a/trajectory.tum").read_bytes() == (tmp_path / "b/trajectory.tum").read_bytes()
 
 
 def test_unreadable_frames_are_left_out_and_counted(fake_slam, tmp_path):
     """A truncated image costs its frame only; the log and metrics say so, and panels don't stumble over it."""
-    result = pipeline.run(FakeSequence(8, unreadable=(0, 3, 7)), Config(), tmp_path)
-    assert result.metrics["frames"]["unreadable"] == 3 and result.metrics["frames"]["processed"] == 5
+    result = run_sequence(FakeSequence(8, unreadable=(0, 3, 7)), Config(), tmp_path)
+    assert result.metrics.frames.unreadable == 3 and result.metrics.frames.processed == 5
     assert "frame 3 left out: frame000003.jpg is truncated" in result.folder.log.read_text()
     left_out = read_json(result.folder.frame_records)["left_out"]
     assert left_out[1] == {"index": 3, "message": "frame000003.jpg is truncated"}
@@ -123,32 +123,32 @@ def test_unreadable_frames_are_left_out_and_counted(fake_slam, tmp_path):
 def test_no_readable_frame_is_an_error_with_metrics(fake_slam, tmp_path):
     """When nothing can be read the run fails, and metrics.json says why."""
     with pytest.raises(DatasetError, match="none of the 3"):
-        pipeline.run(FakeSequence(3, unreadable=(0, 1, 2)), Config(), tmp_path)
+        run_sequence(FakeSequence(3, unreadable=(0, 1, 2)), Config(), tmp_path)
     metrics = metrics_of(tmp_path)
     assert metrics["status"] == "failed" and "none of the 3" in metrics["error"]
 
 
 def test_frames_slice_and_first_pose(fake_slam, tmp_path):
     """A slice selects frames by number, and the first one's true pose anchors the map."""
-    result = pipeline.run(FakeSequence(10), Config(), tmp_path, frames=slice(2, 9, 3))
+    result = run_sequence(FakeSequence(10), Config(), tmp_path, frames=(2, 9, 3))
     np.testing.assert_array_equal(read_tum(result.folder.trajectory)[0], np.array([2, 5, 8]) / 30)
     np.testing.assert_array_equal(fake_slam.made[-1].given[0], true_pose(2))
 
 
 @pytest.mark.parametrize(
-    ("frames", "message"), [(slice(20, 30), "20:30: selects none of the 8"), (slice(None, None, -1), "step -1")]
+    ("frames", "message"), [((20, 30, None), "20:30: selects none of the 8"), ((None, None, -1), "step -1")]
 )
 def test_frames_that_select_nothing_are_config_errors(fake_slam, tmp_path, frames, message):
     """An empty or backward slice is refused before anything is written."""
     with pytest.raises(ConfigError, match=message):
-        pipeline.run(FakeSequence(8), Config(), tmp_path / "run", frames=frames)
+        run_sequence(FakeSequence(8), Config(), tmp_path / "run", frames=frames)
     assert not (tmp_path / "run").exists()
 
 
 def test_interrupt_keeps_what_there_is(fake_slam, tmp_path):
     """After ctrl-C in frame 5 the five frames before it are written in full."""
     fake_slam.interrupt_at = 5
-    result = pipeline.run(FakeSequence(8), Config(), tmp_path)
+    result = run_sequence(FakeSequence(8), Config(), tmp_path)
     assert result.status == metrics_of(tmp_path)["status"] == "interrupted"
     assert len(read_tum(result.folder.trajectory)[0]) == 5
     assert result.ate is not None and result.folder.mesh.exists() and result.folder.panels.exists()
@@ -157,7 +157,7 @@ def test_interrupt_keeps_what_there_is(fake_slam, tmp_path):
 def test_interrupt_before_the_first_frame_is_done(fake_slam, tmp_path):
     """With no frame finished there is still metrics.json."""
     fake_slam.interrupt_at = 0
-    assert pipeline.run(FakeSequence(8), Config(), tmp_path).status == "interrupted"
+    assert run_sequence(FakeSequence(8), Config(), tmp_path).status == "interrupted"
     assert metrics_of(tmp_path)["frames"]["processed"] == 0
     assert not (tmp_path / "trajectory.tum").exists()
 
@@ -165,7 +165,7 @@ def test_interrupt_before_the_first_frame_is_done(fake_slam, tmp_path):
 def test_second_interrupt_ends_the_writing(fake_slam, tmp_path, monkeypatch):
     """Ctrl-C while the mesh is extracted leaves the trajectory and the metrics."""
     monkeypatch.setattr(fake_slam, "mesh", lambda self, voxel=0.02: (_ for _ in ()).throw(KeyboardInterrupt))
-    assert pipeline.run(FakeSequence(4), Config(), tmp_path).status == "interrupted"
+    assert run_sequence(FakeSequence(4), Config(), tmp_path).status == "interrupted"
     assert "ate_m" in metrics_of(tmp_path) and (tmp_path / "trajectory.tum").exists()
 
 
@@ -173,7 +173,7 @@ def test_failure_writes_metrics_and_passes_on(fake_slam, tmp_path):
     """An unexpected exception reaches the caller; metrics.json and log.txt hold it."""
     fake_slam.fail_at = 2
     with pytest.raises(RuntimeError, match="out of memory"):
-        pipeline.run(FakeSequence(4), Config(), tmp_path)
+        run_sequence(FakeSequence(4), Config(), tmp_path)
     metrics = metrics_of(tmp_path)
     assert metrics["status"] == "failed" and metrics["error"] == "RuntimeError: out of memory"
     assert metrics["frames"]["processed"] == 2
@@ -184,15 +184,15 @@ def test_failure_writes_metrics_and_passes_on(fake_slam, tmp_path):
 def test_no_mesh_is_reported_not_fatal(fake_slam, tmp_path):
     """A map without a surface ends in an entry in metrics.json; the rest is written."""
     fake_slam.mesh_fails = True
-    result = pipeline.run(FakeSequence(4), Config(), tmp_path, truth_mesh=wall())
-    assert result.status == "finished" and result.metrics["mesh"] == {"error": "the map has no surface"}
+    result = run_sequence(FakeSequence(4), Config(), tmp_path, truth_mesh=wall())
+    assert result.status == "finished" and metrics_of(tmp_path)["mesh"] == {"error": "the map has no surface"}
     assert not result.folder.mesh.exists() and result.folder.panels.exists()
 
 
 def test_without_ground_truth(fake_slam, tmp_path):
     """No truth: no ATE, no truth file, and the plots are still drawn."""
-    result = pipeline.run(FakeSequence(4, no_truth=tuple(range(4))), Config(), tmp_path)
-    assert result.ate is None and "ate_m" not in result.metrics
+    result = run_sequence(FakeSequence(4, no_truth=tuple(range(4))), Config(), tmp_path)
+    assert result.ate is None and "ate_m" not in metrics_of(tmp_path) and not result.metrics.has("ate_m")
     assert not result.folder.ground_truth.exists()
     assert result.folder.error_plot.exists() and result.folder.top_view.exists()
     assert fake_slam.made[-1].given == [None] * 4
@@ -201,16 +201,16 @@ def test_without_ground_truth(fake_slam, tmp_path):
 def test_partial_ground_truth_and_lost_frames(fake_slam, tmp_path):
     """Frames without truth are skipped in the ATE and counted; a lost frame is counted and drawn."""
     fake_slam.lost_at = 3
-    result = pipeline.run(FakeSequence(8, no_truth=(2,)), Config(), tmp_path)
-    assert result.metrics["ate_m"]["frames_without_truth"] == 1
-    assert result.metrics["frames"]["LOST"] == 1 and result.metrics["frames"]["OK"] == 7
+    result = run_sequence(FakeSequence(8, no_truth=(2,)), Config(), tmp_path)
+    assert result.metrics.ate_m.frames_without_truth == 1
+    assert result.metrics.frames.LOST == 1 and result.metrics.frames.OK == 7
     assert len(read_tum(result.folder.ground_truth)[0]) == 7
 
 
 def test_reconstruction_against_a_truth_mesh(fake_slam, small_evaluation, tmp_path):
     """The fake's mesh is the true wall: all of what was seen is covered, and the protocol is named."""
-    result = pipeline.run(FakeSequence(2), Config(), tmp_path, truth_mesh=wall())
-    figures = result.metrics["reconstruction"]
+    result = run_sequence(FakeSequence(2), Config(), tmp_path, truth_mesh=wall())
+    figures = metrics_of(tmp_path)["reconstruction"]
     assert figures["protocol"] == result.reconstruction.protocol == "frustum+occlusion"
     assert figures["completion_ratio_5cm"] == figures["f_score_5cm"] == 1.0
     assert figures["accuracy_m"] < 0.02 and figures["completion_m"] < 0.02
@@ -223,7 +223,7 @@ def test_evaluate_run_has_the_figures_of_the_run(fake_slam, small_evaluation, tm
     """What metrics.json says of the surface, the files of the run say as well, although its own poses are 1 cm off."""
     monkeypatch.setattr(revisit, "open_source", lambda source: FakeSequence(3))
     wall().export(tmp_path / "wall.ply")
-    result = pipeline.run(FakeSequence(3), Config(), tmp_path / "run", truth_mesh=wall(), source=Source("x"), seed=5)
+    result = run_sequence(FakeSequence(3), Config(), tmp_path / "run", truth_mesh=wall(), source=Source("x"), seed=5)
     again = revisit.evaluate_run(result.folder, truth_mesh=tmp_path / "wall.ply")["reconstruction"]
     written = metrics_of(tmp_path / "run")["reconstruction"]
     for name in ("accuracy_m", "completion_m", "completion_ratio_5cm", "f_score_5cm"):
@@ -235,7 +235,7 @@ def test_evaluate_run_under_every_protocol(fake_slam, small_evaluation, tmp_path
     """The first protocol is the one in its usual place; each set of figures says which it is."""
     monkeypatch.setattr(revisit, "open_source", lambda source: FakeSequence(2))
     wall().export(tmp_path / "wall.ply")
-    result = pipeline.run(FakeSequence(2), Config(), tmp_path / "run", source=Source("x"))
+    result = run_sequence(FakeSequence(2), Config(), tmp_path / "run", source=Source("x"))
     metrics = revisit.evaluate_run(
         result.folder, truth_mesh=tmp_path / "wall.ply", protocols=["frustum+occlusion+virtual", "frustum"]
     )
@@ -249,7 +249,7 @@ def test_evaluate_run_renders_input_views(fake_slam, tmp_path, monkeypatch):
     """PSNR, SSIM and depth L1 of the frames that were asked for, by the fake's flat grey rendering."""
     sequence = FakeSequence(8)
     monkeypatch.setattr(revisit, "open_source", lambda source: sequence)
-    result = pipeline.run(sequence, Config(), tmp_path, source=Source("x"))
+    result = run_sequence(sequence, Config(), tmp_path, source=Source("x"))
     rendering = revisit.evaluate_run(result.folder, rendered_views=2)["rendering"]
     assert rendering["frames"] == [0, 7] and rendering["depth_l1_m"] == pytest.approx(0.03, abs=1e-6)
     grey = np.full((24, 32, 3), 0.2)
@@ -259,7 +259,7 @@ def test_evaluate_run_renders_input_views(fake_slam, tmp_path, monkeypatch):
 
 def test_extract_mesh_options(fake_slam, tmp_path):
     """A forecast has a file of its own, the suffix decides, refinement runs first, and a wrong suffix costs no work."""
-    folder = pipeline.run(FakeSequence(2), Config(), tmp_path).folder
+    folder = run_sequence(FakeSequence(2), Config(), tmp_path).folder
     before = folder.mesh.read_bytes()
     mesh, path = revisit.extract_mesh(folder, forecast=True)
     assert path == folder.forecast_mesh and mesh.metadata["forecast_faces"] == 1
@@ -273,9 +273,21 @@ def test_extract_mesh_options(fake_slam, tmp_path):
 
 
 def test_progress_reports_each_frame(fake_slam, tmp_path):
-    """The callback sees every frame, the ATE so far, and unreadable frames as done."""
-    seen = []
-    pipeline.run(FakeSequence(6, unreadable=(1,)), Config(), tmp_path, on_frame=seen.append)
+    """The observer sees every frame, the ATE so far, and unreadable frames as done; then what it came to."""
+    seen, told = [], []
+
+    class Watcher(Observer):
+        def begin(self, name):
+            told.append(name)
+
+        def frame(self, progress):
+            seen.append(progress)
+
+        def done(self, result):
+            told.append(result.folder.report.exists())
+
+    run_sequence(FakeSequence(6, unreadable=(1,)), Config(), tmp_path, observer=Watcher())
+    assert told == ["fake sequence", True]
     assert [p.done for p in seen] == [1, 3, 4, 5, 6] and {p.total for p in seen} == {6}
     assert seen[0].ate_rmse == pytest.approx(0, abs=1e-12) and seen[-1].ate_rmse > 0.001
     assert all(p.fps > 0 for p in seen)
@@ -284,7 +296,7 @@ def test_progress_reports_each_frame(fake_slam, tmp_path):
 def test_log_handler_is_removed(fake_slam, tmp_path):
     """A run leaves the logger of the process as it was."""
     before = list(logging.getLogger("warpslam").handlers)
-    pipeline.run(FakeSequence(2), Config(), tmp_path)
+    run_sequence(FakeSequence(2), Config(), tmp_path)
     assert logging.getLogger("warpslam").handlers == before
 
 
@@ -327,17 +339,17 @@ def test_top_view_drops_the_upright_axis():
 
 def test_evaluate_run_reproduces_the_metrics(fake_slam, tmp_path):
     """The figures computed from the files are those that the run wrote, to the nanometre of the file."""
-    result = pipeline.run(FakeSequence(8, no_truth=(2,)), Config(), tmp_path)
+    result = run_sequence(FakeSequence(8, no_truth=(2,)), Config(), tmp_path)
     metrics = revisit.evaluate_run(result.folder)
     assert metrics["frames"] == {"estimated": 8, "compared": 7}
     for how in ("aligned", "unaligned"):
-        for name, value in result.metrics["ate_m"][how].items():
+        for name, value in metrics_of(tmp_path)["ate_m"][how].items():
             assert metrics["ate_m"][how][name] == pytest.approx(value, abs=5e-9)
 
 
 def test_evaluate_run_against_another_trajectory(fake_slam, tmp_path):
     """An external truth is paired by time; one from another day has no partner."""
-    result = pipeline.run(FakeSequence(8), Config(), tmp_path / "run")
+    result = run_sequence(FakeSequence(8), Config(), tmp_path / "run")
     (tmp_path / "far.tum").write_text("1e9 0 0 0 0 0 0 1\n")
     with pytest.raises(DatasetError, match="same sequence"):
         revisit.evaluate_run(result.folder, tmp_path / "far.tum")
@@ -347,7 +359,7 @@ def test_evaluate_run_against_another_trajectory(fake_slam, tmp_path):
 def test_render_frame_of_a_run(fake_slam, tmp_path, monkeypatch):
     """A frame that was used is drawn; one that was not, or isn't in the sequence, is an InputError."""
     monkeypatch.setattr(revisit, "open_source", lambda source: FakeSequence(8))
-    result = pipeline.run(FakeSequence(8), Config(), tmp_path, frames=slice(0, 8, 2), source=Source("x"))
+    result = run_sequence(FakeSequence(8), Config(), tmp_path, frames=(0, 8, 2), source=Source("x"))
     path = revisit.render_frame(result.folder, 4)
     assert path.name == "render_000004.png" and Image.open(path).size[0] > 1000
     with pytest.raises(InputError, match="was not used"):
@@ -377,18 +389,18 @@ def test_given_poses_replace_those_of_the_sequence(fake_slam, tmp_path):
     given = np.tile(np.eye(4), (3, 1, 1))
     given[:, 2, 3] = [1.0, 2.0, 3.0]
     write_tum(tmp_path / "given.tum", np.array([0, 1, 3]) / 30 + 0.001, given)
-    result = pipeline.run(FakeSequence(4), Config(), tmp_path / "run", poses=tmp_path / "given.tum")
+    result = run_sequence(FakeSequence(4), Config(), tmp_path / "run", poses=str(tmp_path / "given.tum"))
     np.testing.assert_allclose([T[2, 3] for T in fake_slam.made[-1].given], [1.0, 2.0, 3.0])
-    assert result.metrics["frames"]["unreadable"] == 1
+    assert result.metrics.frames.unreadable == 1
     assert "frame 2 left out" in result.folder.log.read_text()
     np.testing.assert_allclose(read_tum(result.folder.ground_truth)[1][2], true_pose(3), atol=1e-8)
     with pytest.raises(DatasetError, match="none.tum"):
-        pipeline.run(FakeSequence(4), Config(), tmp_path / "run", poses=tmp_path / "none.tum")
+        run_sequence(FakeSequence(4), Config(), tmp_path / "run", poses=str(tmp_path / "none.tum"))
 
 
 def test_metrics_name_the_method_and_its_map(fake_slam, tmp_path):
     """Memory and cost of the map are in metrics.json, with the method that made it."""
-    metrics = pipeline.run(FakeSequence(3), Config(), tmp_path).metrics
+    metrics = run_sequence(FakeSequence(3), Config(), tmp_path).metrics.to_dict()
     assert metrics["method"] == "nice-slam" and metrics["poses"] is None
     assert metrics["map"] == {"bytes": 2_500_000, "flops_per_point": 102_598}
 
@@ -396,4 +408,4 @@ def test_metrics_name_the_method_and_its_map(fake_slam, tmp_path):
 def test_unknown_method(tmp_path):
     """The message lists the methods."""
     with pytest.raises(ConfigError, match="nice-slam, imap, tsdf"):
-        pipeline.run(FakeSequence(3), Config(), tmp_path, method="orb")
+        run_sequence(FakeSequence(3), Config(), tmp_path, method="orb")

@@ -15,6 +15,7 @@ import pytest
 from tests.conftest import REPOSITORY
 from warpslam import cli
 from warpslam.camera import Intrinsics
+from warpslam.config import Config
 from warpslam.pipeline import run as pipeline
 from warpslam.runs.folder import RunFolder
 from warpslam.slam import Slam
@@ -38,7 +39,8 @@ SAME = ("trajectory.tum", "mesh.ply", "map.safetensors", "frames.csv")
 def no_plots():
     """Figures take longer than all else here and have no part in it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline._Run, "_draw_plots", lambda self: None)
+        patch.setattr(pipeline, "draw_plots", lambda *arguments: None)
+        patch.setattr(pipeline, "draw_panels", lambda *arguments: None)
         yield
 
 
@@ -231,3 +233,15 @@ def test_run_starts_from_a_map(uninterrupted, recording, tmp_path, capsys):
     assert "grid.fine_spacing = 0.5 does not fit the map" in capsys.readouterr().err
     assert cli.main(["run", str(recording), "--localize"]) == 2
     assert "--map" in capsys.readouterr().err
+
+
+def test_the_settings_of_a_run_make_the_same_run(uninterrupted, recording, tmp_path):
+    """--config takes the config.yaml that a run wrote: the same bytes again; --set goes on top of it."""
+    command = ["run", str(recording), "--device", "cpu", "--seed", "3", "--config", str(uninterrupted / "config.yaml")]
+    assert cli.main([*command, "-o", str(tmp_path / "same")]) == 0
+    assert_same(tmp_path / "same", uninterrupted)
+    assert (tmp_path / "same" / "config.yaml").read_bytes() == (uninterrupted / "config.yaml").read_bytes()
+    changed = ["--set", "mapping.every=3", "--frames", "0:2", "-o", str(tmp_path / "other")]
+    assert cli.main([*command, *changed]) == 0
+    was, changed = (Config.load(folder / "config.yaml") for folder in (uninterrupted, tmp_path / "other"))
+    assert changed == was.updated(["mapping.every=3"]) != was

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections import Counter, namedtuple
 
 import numpy as np
@@ -16,6 +15,7 @@ from tests.test_slam import CAMERA, new_slam
 from warpslam import cli
 from warpslam.camera import Intrinsics
 from warpslam.errors import WarpSlamError
+from warpslam.field import passes
 from warpslam.field.arrays import Gradients, Thresholds
 from warpslam.field.passes import render
 from warpslam.kernels.decoder.build import decoders_for
@@ -65,7 +65,7 @@ def run(frames):
     """A run with two slices on any machine, profiled from the first frame to the mesh."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(recorder, "matrix_peak_gflops", lambda: 100.0)
-        patch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
+        patch.setattr("psutil.Process.cpu_affinity", lambda self: [0, 1], raising=False)
         slam = new_slam(*SETTINGS)
         with warpslam.profile() as profile:
             timings = [result.timings for result in steps(slam, frames)]
@@ -250,8 +250,8 @@ def test_counted_points_are_those_computed(frames, min_transmittance, monkeypatc
     batch.logit_grad.assign(gradient)
     batch.point_grad.zero_()
     batch.steep_count.zero_()
-    batch.launcher.launch(*batch._steep(0, batch.count, 0, 0.25))
-    step = batch._geometry_adjoint(arrays, "middle", Gradients(points=True), 0, batch.count, 0, batch.point_grad)
+    batch.launcher.launch(*passes.steep_samples(batch, 0, batch.count, 0, 0.25))
+    step = passes.geometry_adjoint(batch, arrays, "middle", Gradients(points=True), 0, batch.count, 0, batch.point_grad)
     with warpslam.profile() as profile:
         batch.launcher.launch(*step)
     (launch,) = profile.launches

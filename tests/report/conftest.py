@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from tests.fakes import FakeSequence, FakeSlam, wall
+from tests.fakes import FakeSequence, FakeSlam, run_sequence, wall
 from warpslam.config import Config
+from warpslam.pipeline import results
 from warpslam.pipeline import run as pipeline
 from warpslam.report import pictures as images
-from warpslam.report import plots
 from warpslam.runs.folder import RunFolder
 from warpslam.runs.request import Source
 from warpslam.storage.json_files import read_json, write_json
@@ -28,19 +28,19 @@ def make_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., R
     """Make a run folder: ``make_run("name", sequence, slam attributes)``, with the figures that only a real map has."""
 
     for plot in ("plot_top_view", "plot_error", "plot_panels"):
-        monkeypatch.setattr(plots, plot, lambda *arguments: None)
+        monkeypatch.setattr(results, plot, lambda *arguments: None)
     monkeypatch.setattr(images, "SUPERSAMPLING", 1)
 
     def make(name: str = "run", sequence: FakeSequence | None = None, **behaviour: Any) -> RunFolder:
         slam = type("Slam", (FakeSlam,), behaviour)
-        monkeypatch.setattr(pipeline, "build_slam", lambda camera, config, device, seed: slam(camera))
+        monkeypatch.setattr(pipeline, "build_slam", lambda camera, config, device, seed, method: slam(camera))
         source = Source("somewhere", command="warpslam run somewhere --seed 0")
         sequence = sequence or FakeSequence(8)
         try:
-            result = pipeline.run(sequence, Config(), tmp_path / name, source=source, truth_mesh=wall())
+            result = run_sequence(sequence, Config(), tmp_path / name, source=source, truth_mesh=wall())
         except RuntimeError:
             return RunFolder(tmp_path / name)
-        if result.metrics["frames"]["processed"] > 4:
+        if result.metrics.frames.processed > 4:
             metrics = read_json(result.folder.metrics)
             metrics |= {"levels": LEVELS, "observed_volume_m3": 12.5, "bounds_m": [[0, 0, 0], [4, 3, 2.5]]}
             metrics["keyframes"] = {"frames": [0, 2, 4], "overlaps": [[0, 1, 0.8], [1, 2, 0.3], [0, 2, 0.1]]}

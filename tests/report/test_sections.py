@@ -154,7 +154,7 @@ def test_a_report_that_fails_does_not_fail_the_run(make_run, monkeypatch):
     def refuse(folder):
         raise ConfigError("the disk is full")
 
-    monkeypatch.setattr("warpslam.report.write_report", refuse)
+    monkeypatch.setattr("warpslam.pipeline.run.write_report", refuse)
     folder = make_run()
     assert read_json(folder.metrics)["status"] == "finished" and not folder.report.exists()
     assert "no report: the disk is full" in folder.log.read_text()
@@ -166,7 +166,7 @@ def test_a_report_that_breaks_does_not_hide_why_the_run_failed(make_run, monkeyp
     def break_(folder):
         raise ZeroDivisionError
 
-    monkeypatch.setattr("warpslam.report.write_report", break_)
+    monkeypatch.setattr("warpslam.pipeline.run.write_report", break_)
     folder = make_run(fail_at=2)
     assert read_json(folder.metrics)["error"] == "RuntimeError: out of memory"
     assert "ZeroDivisionError" in folder.log.read_text()

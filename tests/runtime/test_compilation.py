@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from pathlib import Path
 
@@ -72,7 +71,7 @@ def test_compiles_once_and_says_so(empty_cache):
 
 def test_modules_load_side_by_side(monkeypatch):
     """With two cores two modules are in work at once, reports come one at a time and count up to the total."""
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1}, raising=False)
+    monkeypatch.setattr(compilation, "process_cores", lambda: [0, 1])
     together = threading.Barrier(2, timeout=20)
     names, seen, inside = ["warpslam.kernels.losses", "warpslam.kernels.adam"], [], []
     monkeypatch.setattr(compilation, "module_names", lambda target: names)
@@ -96,8 +95,8 @@ def test_an_error_of_a_module_comes_through(monkeypatch):
         raise RuntimeError(f"no {modules[0].name}")
 
     monkeypatch.setattr(wp, "force_load", fail)
-    for cores in ({0}, {0, 1}):
-        monkeypatch.setattr(os, "sched_getaffinity", lambda pid, cores=cores: cores, raising=False)
+    for cores in ([0], [0, 1]):
+        monkeypatch.setattr(compilation, "process_cores", lambda cores=cores: cores)
         with pytest.raises(RuntimeError, match="no warpslam"):
             compile_kernels(CPU)
 
@@ -135,12 +134,12 @@ def test_warmup_prints_a_line_a_module(empty_cache, monkeypatch, capsys):
 def test_run_shows_and_records_what_it_compiles(empty_cache, monkeypatch, tmp_path, capsys):
     """Without a terminal a line before each module that must be compiled; metrics and timing name them."""
     from tests.fakes import FakeSlam
-    from warpslam.pipeline import finished as revisit
     from warpslam.storage.json_files import read_json
 
-    monkeypatch.setattr(pipeline, "build_slam", lambda intrinsics, config, device, seed: FakeSlam(intrinsics))
-    monkeypatch.setattr(pipeline._Run, "_draw_plots", lambda self: None)
-    monkeypatch.setattr(revisit, "open_source", lambda source: FakeSequence(3))
+    monkeypatch.setattr(pipeline, "build_slam", lambda intrinsics, config, device, seed, method: FakeSlam(intrinsics))
+    monkeypatch.setattr(pipeline, "draw_plots", lambda *arguments: None)
+    monkeypatch.setattr(pipeline, "draw_panels", lambda *arguments: None)
+    monkeypatch.setattr(pipeline, "open_source", lambda source: FakeSequence(3))
     for name, compiled in (("first", SMALL), ("second", [])):
         assert cli.main(["run", "seq", "--device", "cpu", "-o", str(tmp_path / name)]) == 0
         out = capsys.readouterr().out

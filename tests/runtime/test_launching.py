@@ -1,6 +1,5 @@
 """Launchers on two threads at a time: their tapes stay apart, and their slices share workers without a deadlock."""
 
-import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
@@ -20,7 +19,7 @@ WAIT = 60.0  # [s]; a test that hangs fails instead
 @pytest.fixture
 def two_slices(monkeypatch):
     """As on a machine of two cores, whatever this one has."""
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    monkeypatch.setattr("psutil.Process.cpu_affinity", lambda self: [0, 1], raising=False)
 
 
 def gradients(iteration: Iteration, kind: str) -> list[np.ndarray]:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import safetensors.numpy
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -55,6 +56,15 @@ def test_comes_back_as_it_was(content, tmp_path):
     assert_content(path)
     assert path.read_bytes() == content
     assert [file.name for file in path.parent.iterdir()] == ["b.safetensors"]
+
+
+def test_safetensors_reads_the_same(content):
+    """The published package finds every array."""
+    arrays = safetensors.numpy.load(content)
+    assert arrays.keys() == ARRAYS.keys()
+    for name, array in ARRAYS.items():
+        assert arrays[name].dtype == array.dtype and arrays[name].shape == array.shape, name
+        np.testing.assert_array_equal(arrays[name], array)
 
 
 def test_layout_is_that_of_safetensors(content):
@@ -106,19 +116,20 @@ def resealed(content: bytes, change) -> bytes:
 
     (size,) = struct.unpack("<Q", content[:8])
     table = json.loads(content[8 : 8 + size])
+    table["__metadata__"] = json.loads(table["__metadata__"]["warpslam"])
     change(table)
-    table["__metadata__"]["sha256"] = "0" * 64
+    table["__metadata__"] = {"warpslam": json.dumps({**table["__metadata__"], "sha256": "0" * 64})}
     blank = json.dumps(table).encode()
-    digest = hashlib.sha256(blank + content[8 + size :]).hexdigest()
-    text = blank.replace(b"0" * 64, digest.encode())
-    return struct.pack("<Q", len(text)) + text + content[8 + size :]
+    length = struct.pack("<Q", len(blank))
+    digest = hashlib.sha256(length + blank + content[8 + size :]).hexdigest()
+    return length + blank.replace(b"0" * 64, digest.encode()) + content[8 + size :]
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda table: table["__metadata__"].update(version="4"), "field version is 4.* update warpslam"),
-        (lambda table: table["__metadata__"].update(version="2"), "field version is 2.* warpslam that wrote it"),
+        (lambda table: table["__metadata__"].update(version=4), "field version is 4.* update warpslam"),
+        (lambda table: table["__metadata__"].update(version=2), "field version is 2.* warpslam that wrote it"),
         (lambda table: table["__metadata__"].update(version="x" * 9), "field version"),
         (lambda table: table["__metadata__"].update(format="other"), "field format is 'other'"),
         (lambda table: table["__metadata__"].update(header="[]"), "field header"),

@@ -208,25 +208,16 @@ class Runner:
         params: list = [bounds]
         ranges: list[tuple[int, int]] = []
 
-        def add(array: Any) -> None:
-            if isinstance(array, wp.array) and array.ptr:
-                ranges.append(
-                    (array.ptr, array.ptr + array.capacity if array.is_contiguous else array.ptr + _extent(array))
-                )
-
         for argument, value in zip(kernel.adj.args, values, strict=True):
             params.append(_object(wpc.pack_arg(kernel, argument.type, argument.label, value, device, False)))
-            for array in _arrays(value):
-                add(array)
-            if isinstance(value, wp.array):
-                add(value.grad)
+            ranges += _ranges(value)
         if gradients is not None:
             for argument, value in zip(kernel.adj.args, gradients, strict=True):
                 given = value
                 if given is None and not wp.types.is_array(argument.type):
                     given = 0
                 params.append(_object(wpc.pack_arg(kernel, argument.type, argument.label, given, device, True)))
-                add(value)
+                ranges += _ranges(value)
         return bounds, params, ranges
 
     def launch(self, kernel: Any, bounds: Any, params: list, ranges: list, adjoint: bool) -> None:
@@ -261,18 +252,24 @@ _COLUMNS = (
 )  # fmt: skip
 
 
+def _ranges(value: Any) -> list[tuple[int, int]]:
+    """First address and the one behind the last of an array and its gradient, or of all those in a struct."""
+    import warp as wp
+
+    if hasattr(value, "_cls"):
+        return [found for name in value._cls.vars for found in _ranges(getattr(value, name))]
+    if not isinstance(value, wp.array) or not value.ptr:
+        return []
+    stop = value.ptr + (value.capacity if value.is_contiguous else _extent(value))
+    return [(value.ptr, stop), *_ranges(value.grad)]
+
+
 def _extent(array: Any) -> int:
     """Bytes from the first to behind the last element of a view."""
     import warp as wp
 
     last = sum((n - 1) * s for n, s in zip(array.shape, array.strides, strict=True))
     return last + wp.types.type_size_in_bytes(array.dtype)
-
-
-def _arrays(value: Any) -> list[Any]:
-    """The argument itself, or what a struct holds."""
-    fields = getattr(getattr(value, "_cls", None), "vars", None)
-    return [value] if fields is None else [array for name in fields for array in _arrays(getattr(value, name))]
 
 
 def _object(value: Any) -> Any:

@@ -319,6 +319,8 @@ class Translator:
             return f"(uint64_t)(uintptr_t)&{text}"
         if text in self.locals:
             return f"(uint64_t)(uintptr_t){self._register(text)}"
+        if text in self.param_index:
+            return f"(uint64_t)(uintptr_t)P[{self.param_index[text]}]"
         return f"({c_type}){self._immediate(text)}"
 
     @staticmethod
@@ -359,6 +361,8 @@ class Translator:
                 return f"({base} + {offset})"
             if base == self.current.result:
                 return f"(result + {offset})"
+            if base.startswith("%"):  # the address of a struct
+                return f"((char*)(uintptr_t)({self._value(base, 'u64')} + {offset}))"
             raise UnsupportedInstruction(f"parameter {base}")
         if space == "shared":
             return f"(c->shared + {self._value(base, 'u32')} + {offset})"

@@ -324,7 +324,7 @@ class Imap(Baseline):
         """View of the map from a pose, every ``stride``-th pixel; a ``depth`` image [m] guides the samples if given.
 
         Raises:
-            InputError: the map is empty, or the pose is no rigid transform.
+            InputError: The map is empty, or the pose is no rigid transform.
         """
         if not self._seen:
             raise InputError("the map is empty: step at least one frame first")

@@ -16,6 +16,7 @@ from warpslam.kernels import imap_density, rays
 from warpslam.kernels import imap_network as imap
 from warpslam.kernels.compositing import Box
 from warpslam.kernels.grid import Vec32
+from warpslam.kernels.imap_density import Composited
 from warpslam.kernels.samples import Span
 from warpslam.runtime.launching import Launcher, Step
 from warpslam.runtime.program import run_slices
@@ -99,14 +100,12 @@ def unpack(rows: np.ndarray) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class Wanted:
-    """Which gradients an iteration wants.
-
-    points: Sample positions, and through them rays and poses.
-    weights: (slices, WEIGHT_ROWS) buffers of `Vec32`, or None.
-    """
+    """Which gradients an iteration wants."""
 
     points: bool = False
+    """Sample positions, and through them rays and poses."""
     weights: wp.array | None = None
+    """(slices, WEIGHT_ROWS) buffers of `Vec32`, or None."""
 
 
 class ImapBatch(RayBatch):
@@ -147,10 +146,10 @@ class ImapBatch(RayBatch):
         return self.logit
 
     @property
-    def composited(self) -> imap_density.Composited:
+    def composited(self) -> Composited:
         """The samples as compositing takes them."""
         return struct(
-            imap_density.Composited,
+            Composited,
             order=self.order,
             density=self.density,
             color=self.color,

@@ -37,7 +37,7 @@ def import_open3d() -> Any:
     """The package open3d.
 
     Raises:
-        MissingDependencyError: it is not installed, or lacks a system library.
+        MissingDependencyError: It is not installed, or lacks a system library.
     """
     try:
         import open3d
@@ -135,8 +135,8 @@ class Tsdf(Baseline):
         short, and on its first call an image with holes.
 
         Raises:
-            InputError: the volume is empty, or the pose is no rigid transform.
-            MeshError: there is no surface.
+            InputError: The volume is empty, or the pose is no rigid transform.
+            MeshError: There is no surface.
         """
         T = check_transform(T_world_camera)
         if self.block_count == 0:
@@ -144,9 +144,8 @@ class Tsdf(Baseline):
         vertices, faces, colors = self._surface
         camera = self.intrinsics.strided(stride)
         v, u = np.mgrid[: camera.height, : camera.width]
-        local = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
         # Directions have length 1 along the camera's z axis, so that the way to a hit is its z-depth.
-        directions = local @ T[:3, :3].T
+        directions = camera.backproject(u, v, 1.0) @ T[:3, :3].T
         rays = np.concatenate([np.broadcast_to(T[:3, 3], directions.shape), directions], axis=-1).astype(np.float32)
         hits = self._scene.cast_rays(self._o3d.core.Tensor(rays))
         z, face, uv = (hits[name].numpy() for name in ("t_hit", "primitive_ids", "primitive_uvs"))

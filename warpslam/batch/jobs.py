@@ -5,54 +5,46 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from warpslam import __version__
+from warpslam.config import PRESETS
 from warpslam.errors import ConfigError
-from warpslam.pipeline.methods import DEFAULT_METHOD, check_method
+from warpslam.pipeline.methods import check_method
 from warpslam.runs.folder import as_file_name
+from warpslam.runs.request import RunRequest
 
 
 @dataclass(frozen=True)
 class Job:
-    """One sequence of a batch and how it is run; fields as the options of ``warpslam run``.
-
-    name: Of the folder for its results. frames: Slice as (start, stop, step). poses: Trajectory in the TUM format that
-    is taken as given. checkpoint_every: Frames between two checkpoints; None for none. A method that has none starts
-    again after a stop.
-    """
+    """One run of a batch. A method that has no checkpoints starts again after a stop."""
 
     name: str
-    path: str
-    dataset: str = "auto"
-    camera: str | None = None
-    preset: str | None = None
-    frames: tuple[int | None, int | None, int | None] = (None, None, None)
-    overrides: tuple[str, ...] = ()
-    decoders: str | None = None
-    device: str | None = None
-    seed: int = 0
-    truth_mesh: str | None = None
-    method: str = DEFAULT_METHOD
-    poses: str | None = None
-    checkpoint_every: int | None = None
+    """Of the folder for its results, in the folder of the batch."""
+
+    request: RunRequest
+    """What is asked for; it names its source."""
 
     @property
     def settings_hash(self) -> str:
-        """Of all that decides on the result: the version of warpslam and the fields, but for the checkpoints."""
-        fields = {name: value for name, value in asdict(self).items() if name != "checkpoint_every"}
-        text = json.dumps({**fields, "warpslam": __version__}, sort_keys=True)
+        """Of all that decides on the result: name, request and the version of warpslam, but not the checkpoints."""
+        fields = replace(self.request, checkpoint_every=None).to_dict()
+        text = json.dumps({**fields, "name": self.name, "warpslam": __version__}, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
+    def asking(self, **changes: Any) -> Job:
+        """The same job with other fields of its request."""
+        return replace(self, request=replace(self.request, **changes))
+
     def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
+        """Plain values, for JSON."""
+        return {"name": self.name, "request": self.request.to_dict()}
 
     @classmethod
     def from_dict(cls, fields: dict[str, Any]) -> Job:
         """What `to_dict` gave, after a trip through JSON."""
-        return cls(**{**fields, "frames": tuple(fields["frames"]), "overrides": tuple(fields["overrides"])})
+        return cls(fields["name"], RunRequest.from_dict(fields["request"]))
 
 
 def with_free_names(jobs: Iterable[Job]) -> list[Job]:
@@ -76,12 +68,11 @@ def check_jobs(jobs: Sequence[Job]) -> None:
     Raises:
         ConfigError: A method, a preset, a setting or a number of the batch is not usable.
     """
-    from warpslam.config import PRESETS, Config
-
     if not jobs:
         raise ConfigError("the batch is empty: name folders, or a manifest with --manifest")
     for job in jobs:
-        check_method(job.method)
-        if job.checkpoint_every is not None and job.checkpoint_every < 1:
-            raise ConfigError(f"checkpoint_every = {job.checkpoint_every} of {job.name} must be at least 1 frame")
-        Config.from_preset(job.preset or next(iter(PRESETS)), list(job.overrides))
+        every = job.request.checkpoint_every
+        check_method(job.request.method)
+        if every is not None and every < 1:
+            raise ConfigError(f"checkpoint_every = {every} of {job.name} must be at least 1 frame")
+        job.request.settings(next(iter(PRESETS)))

@@ -34,6 +34,7 @@ from warpslam.batch.status import (
     initial_status,
 )
 from warpslam.errors import ConfigError
+from warpslam.runtime.cores import process_cores
 
 WORKER_LOG = "worker.log"
 WORKER_COMMAND = (sys.executable, "-m", "warpslam.batch.worker")
@@ -75,7 +76,7 @@ def split_cores(workers: int) -> list[list[int]]:
     """Cores of each worker: equal shares of those that this process may use, and the same ones by turns if there are
     more workers than cores.
     """
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    cores = process_cores()
     if workers > len(cores):
         return [[cores[slot % len(cores)]] for slot in range(workers)]
     bounds = [len(cores) * slot // workers for slot in range(workers + 1)]

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-from warpslam.batch.jobs import Job
-from warpslam.errors import ConfigError
-from warpslam.runs.request import parse_slice
+import yaml
 
+from warpslam.batch.jobs import Job
+from warpslam.config import Config
+from warpslam.errors import ConfigError
+from warpslam.runs.request import RunRequest, Source, parse_slice
+
+_OF_SOURCE = ("path", "dataset", "camera")
+_PATHS = ("path", "decoders", "truth_mesh", "poses", "map", "config")
+_NUMBERS = ("seed", "checkpoint_every")
 FIELDS = (
-    "path", "name", "dataset", "camera", "preset", "frames", "set", "decoders", "device", "seed", "truth_mesh",
-    "method", "poses", "checkpoint_every",
+    *_OF_SOURCE, "name", "set",
+    *(field.name for field in fields(RunRequest) if field.name not in ("source", "overrides")),
 )  # fmt: skip
+"""Those of `RunRequest`, with its source spelled out, and ``set`` for its overrides."""
 
 
 def read_manifest(path: str | Path, common: Job) -> list[Job]:
     """Jobs of a yaml file: ``sequences``, each a path or a mapping, and ``defaults`` for all of them.
 
-    Fields are path, name, dataset, camera, preset, frames ("A:B:STEP"), set (a list of KEY=VALUE), decoders, device,
-    seed, truth_mesh, method, poses and checkpoint_every (0 for none). Paths are relative to the file.
+    Fields are a name and those of `warpslam.runs.request.RunRequest`, with path, dataset and camera for its source;
+    frames is "A:B:STEP", set a list of KEY=VALUE, config a file of settings, checkpoint_every 0 for none. Paths are
+    relative to the file.
 
     Args:
         path: File.
@@ -29,8 +37,6 @@ def read_manifest(path: str | Path, common: Job) -> list[Job]:
     Raises:
         ConfigError: The file can't be read, or a field is unknown or has a value that does not fit.
     """
-    import yaml
-
     path = Path(path)
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -44,36 +50,51 @@ def read_manifest(path: str | Path, common: Job) -> list[Job]:
     common = _with_fields(common, content.get("defaults") or {}, path, "defaults")
     jobs = []
     for number, entry in enumerate(content["sequences"], start=1):
-        fields = {"path": entry} if isinstance(entry, str) else entry
+        values = {"path": entry} if isinstance(entry, str) else entry
         where = f"sequences, entry {number}"
-        if not isinstance(fields, dict) or not isinstance(fields.get("path"), str):
+        if not isinstance(values, dict) or not isinstance(values.get("path"), str):
             raise ConfigError(f"{path}: {where}: expected a folder, or a mapping with 'path'")
-        job = _with_fields(common, fields, path, where)
-        jobs.append(job if "name" in fields else replace(job, name=Path(job.path).name))
+        job = _with_fields(common, values, path, where)
+        jobs.append(job if "name" in values else replace(job, name=Path(values["path"]).name))
     return jobs
 
 
-def _with_fields(job: Job, fields: Any, path: Path, where: str) -> Job:
-    if not isinstance(fields, dict) or set(fields) - set(FIELDS):
-        raise ConfigError(f"{path}: {where}: got {fields!r}; known fields are {', '.join(FIELDS)}")
-    values: dict[str, Any] = {}
-    for name, value in fields.items():
-        if name == "set":
-            if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-                raise ConfigError(f"{path}: {where}: set = {value!r} must be a list of texts KEY=VALUE")
-            values["overrides"] = (*job.overrides, *value)
-        elif name == "frames":
-            # Unquoted, yaml reads 1:20 as a number in base 60.
-            if not isinstance(value, str):
-                raise ConfigError(f"{path}: {where}: frames = {value!r} must be a text in quotes, such as '0:200'")
-            values["frames"] = parse_slice(value)
-        elif name in ("seed", "checkpoint_every"):
-            if isinstance(value, bool) or not isinstance(value, int):
-                raise ConfigError(f"{path}: {where}: {name} = {value!r} must be a whole number")
-            values[name] = None if name == "checkpoint_every" and value == 0 else value
-        elif not isinstance(value, str):
-            raise ConfigError(f"{path}: {where}: {name} = {value!r} must be a text")
-        else:
-            is_path = name in ("path", "decoders", "truth_mesh", "poses")
-            values[name] = str((path.parent / Path(value).expanduser()).resolve()) if is_path else value
-    return replace(job, **values)
+def _with_fields(job: Job, values: Any, path: Path, where: str) -> Job:
+    if not isinstance(values, dict) or set(values) - set(FIELDS):
+        raise ConfigError(f"{path}: {where}: got {values!r}; known fields are {', '.join(FIELDS)}")
+    if "preset" in values and "config" in values:
+        raise ConfigError(f"{path}: {where}: config and preset do not go together: leave one of them out")
+    read = {name: _read(name, value, path, f"{path}: {where}") for name, value in values.items()}
+    # Of what is here and what is given for all, this is the nearer one.
+    read |= {"config": None} if "preset" in read else {"preset": None} if "config" in read else {}
+    if "set" in read:
+        read["overrides"] = (*job.request.overrides, *read.pop("set"))
+    source = job.request.source or Source("")
+    source = replace(source, **{name: read.pop(name) for name in _OF_SOURCE if name in read})
+    return replace(job, name=read.pop("name", job.name)).asking(source=source, **read)
+
+
+def _read(name: str, value: Any, path: Path, where: str) -> Any:
+    """The value of a field as the request has it."""
+    if name == "set":
+        if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+            raise ConfigError(f"{where}: set = {value!r} must be a list of texts KEY=VALUE")
+        return value
+    if name == "frames":
+        # Unquoted, yaml reads 1:20 as a number in base 60.
+        if not isinstance(value, str):
+            raise ConfigError(f"{where}: frames = {value!r} must be a text in quotes, such as '0:200'")
+        return parse_slice(value)
+    if name in _NUMBERS:
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise ConfigError(f"{where}: {name} = {value!r} must be a whole number")
+        return None if name == "checkpoint_every" and value == 0 else value
+    if name == "localize_only":
+        if not isinstance(value, bool):
+            raise ConfigError(f"{where}: {name} = {value!r} must be true or false")
+        return value
+    if not isinstance(value, str):
+        raise ConfigError(f"{where}: {name} = {value!r} must be a text")
+    if name in _PATHS:
+        value = str((path.parent / Path(value).expanduser()).resolve())
+    return Config.load(value) if name == "config" else value

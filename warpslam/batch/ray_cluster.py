@@ -26,6 +26,7 @@ from warpslam.batch.status import (
     initial_status,
 )
 from warpslam.errors import ConfigError, MissingDependencyError
+from warpslam.runtime.cores import process_cores
 
 RETRIES = 3
 """How often a sequence is started again after its worker was lost."""
@@ -81,8 +82,7 @@ def run_on_ray(
 def _connect(ray: Any, address: str) -> None:
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "warning"}
     if address == "local":
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        options |= {"address": "local", "num_cpus": cores, "include_dashboard": False}
+        options |= {"address": "local", "num_cpus": len(process_cores()), "include_dashboard": False}
     else:
         options["address"] = address
     try:
@@ -93,7 +93,7 @@ def _connect(ray: Any, address: str) -> None:
 
 def _task(job: dict[str, Any], output: str, memory_gb: float | None, threads: int, news: Any) -> str:
     """Runs on a worker."""
-    # Ray counts cores and leaves it to the task to use no more of them.
+    # Ray counts cores and leaves it to the task to use no more of them; set before Warp is loaded.
     os.environ["WARPSLAM_THREADS"] = str(threads)
     from warpslam.batch.worker import execute
 

@@ -9,37 +9,57 @@ from typing import Any
 
 from warpslam.batch.jobs import Job
 from warpslam.errors import DatasetError
+from warpslam.runs import record
 from warpslam.runs.folder import RunFolder
+from warpslam.runs.metrics import RunMetrics
 from warpslam.storage.json_files import read_json, write_json
 
 STATE_FILE = "batch.json"
-FINISHED, FAILED, MEMORY, INTERRUPTED, CRASHED = "finished", "failed", "out of memory", "interrupted", "crashed"
+FINISHED, FAILED, INTERRUPTED = record.FINISHED, record.FAILED, record.INTERRUPTED
+MEMORY, CRASHED = "out of memory", "crashed"
 RUNNING, WAITING, SKIPPED = "running", "waiting", "done before"
 ENDED = (FINISHED, FAILED, MEMORY, INTERRUPTED, CRASHED, SKIPPED)
 
 
 @dataclass(frozen=True)
 class JobStatus:
-    """Where a job stands.
-
-    status: "waiting", "running", "done before", "finished", "failed", "out of memory", "interrupted" or "crashed".
-    done, total: Frames. ate_rmse: So far, or of the end [m]. fps: Frames a second. seconds: Time it took.
-    message: Why it is not finished, or why it could not go on from its checkpoint. attempt: From 1; more than 1 if a
-    worker was lost. resumed_after: Frames that were taken over from a checkpoint.
-    """
+    """Where a job stands."""
 
     name: str
+    """Of the job."""
+
     status: str = WAITING
+    """One of "waiting", "running", "done before", "finished", "failed", "out of memory", "interrupted" or "crashed"."""
+
     done: int = 0
+    """Frames so far."""
+
     total: int = 0
+    """Frames that were selected."""
+
     ate_rmse: float | None = None
+    """So far, or of the end [m]."""
+
     fps: float | None = None
+    """Frames a second."""
+
     seconds: float | None = None
+    """Time it took."""
+
     lost: int = 0
+    """Frames whose pose was not found."""
+
     peak_memory_mib: float | None = None
+    """The most memory that the process has held [MiB]."""
+
     message: str = ""
+    """Why it is not finished, or why it could not go on from its checkpoint."""
+
     attempt: int = 0
+    """From 1; more than 1 if a worker was lost."""
+
     resumed_after: int = 0
+    """Frames that were taken over from a checkpoint."""
 
 
 Update = Callable[[JobStatus], None]
@@ -50,7 +70,10 @@ class BatchState:
     """State file of one job: what it was started with and how it ended."""
 
     path: Path
+    """The file."""
+
     fields: dict[str, Any] = field(default_factory=dict)
+    """Its content."""
 
     @classmethod
     def of(cls, job: Job, output: Path) -> BatchState:
@@ -90,17 +113,17 @@ def ended_status(job: Job, output: Path, known: JobStatus) -> JobStatus:
         attempt=fields.get("attempt", 0),
     )  # fmt: skip
     try:
-        metrics = read_json(RunFolder(output / job.name).metrics)
+        metrics = RunMetrics.read(RunFolder(output / job.name).metrics)
     except DatasetError:  # it came to nothing
         return status
-    frames = metrics.get("frames", {})
+    frames = metrics.frames
     return replace(
         status,
-        done=frames.get("processed", 0) + frames.get("unreadable", 0),
-        total=frames.get("selected", 0),
-        ate_rmse=metrics.get("ate_m", {}).get("aligned", {}).get("rmse"),
-        fps=metrics.get("fps"),
-        lost=frames.get("LOST", 0),
-        peak_memory_mib=metrics.get("peak_memory_mib"),
-        resumed_after=metrics.get("resumed_after", 0),
+        done=(frames.processed or 0) + (frames.unreadable or 0),
+        total=frames.selected or 0,
+        ate_rmse=metrics.ate_m.aligned.rmse,
+        fps=metrics.fps,
+        lost=frames.LOST or 0,
+        peak_memory_mib=metrics.peak_memory_mib,
+        resumed_after=metrics.resumed_after or 0,
     )

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import csv
-import html
 from collections.abc import Sequence
 from pathlib import Path
 
 from warpslam.batch.status import FINISHED, SKIPPED, JobStatus
+from warpslam.report.page import Html, element, join, void
 from warpslam.runs.folder import RunFolder
 
 COLUMNS = ("sequence", "status", "frames", "lost", "ATE RMSE [cm]", "frames/s", "time [s]", "memory [MiB]", "message")
@@ -69,24 +69,24 @@ def _figure(value: float | None, digits: int) -> str:
 def _html(statuses: Sequence[JobStatus], output: Path) -> str:
     rows = []
     for status in statuses:
-        texts = [html.escape(text) for text in cells(status)]
-        name = html.escape(status.name, quote=True)
         folder = RunFolder(output / status.name)
-        links = " ".join(
-            f'<a href="{name}/{file.name}">{text}</a>'
-            for file, text in ((folder.top_view, "path"), (folder.panels, "views"), (folder.mesh, "mesh"))
-            if file.is_file()
-        )
-        body = "".join(
-            f'<td class="number">{text}</td>' if 2 <= column <= 7 else f"<td>{text}</td>"
-            for column, text in enumerate(texts)
-        )
-        row_class = "good" if is_good(status) else "bad"
-        rows.append(f'<tr class="{row_class}">{body}<td>{links}</td></tr>')
-    head = "".join(f"<th>{html.escape(column)}</th>" for column in (*COLUMNS, "files"))
+        files = ((folder.top_view, "path"), (folder.panels, "views"), (folder.mesh, "mesh"))
+        links = [
+            join(element("a", text, href=f"{status.name}/{file.name}"), " ") for file, text in files if file.is_file()
+        ]
+        texts = [
+            element("td", text, class_="number" if 2 <= column <= 7 else None)
+            for column, text in enumerate(cells(status))
+        ]
+        rows.append(element("tr", texts, element("td", links), class_="good" if is_good(status) else "bad"))
     good = sum(map(is_good, statuses))
-    return (
-        f'<!doctype html>\n<html lang="en"><meta charset="utf-8"><title>{html.escape(output.name)}</title>\n'
-        f"<style>{_STYLE}</style>\n<h1>{html.escape(output.name)}: {good} of {len(statuses)} sequences done</h1>\n"
-        f"<table>\n<tr>{head}</tr>\n" + "\n".join(rows) + "\n</table>\n</html>\n"
+    page = element(
+        "html",
+        void("meta", charset="utf-8"),
+        element("title", output.name),
+        element("style", Html(_STYLE)),
+        element("h1", f"{output.name}: {good} of {len(statuses)} sequences done"),
+        element("table", element("tr", [element("th", column) for column in (*COLUMNS, "files")]), rows),
+        lang="en",
     )
+    return f"<!doctype html>\n{page}\n"

@@ -13,14 +13,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from warpslam.batch.jobs import Job
-from warpslam.batch.status import FAILED, FINISHED, INTERRUPTED, MEMORY, RUNNING, BatchState
+from warpslam.batch.status import FAILED, INTERRUPTED, MEMORY, RUNNING, BatchState
 from warpslam.errors import MemoryBudgetError, WarpSlamError
-from warpslam.pipeline.checkpoints import remove_checkpoints
+from warpslam.pipeline.methods import has_checkpoints
+from warpslam.pipeline.observer import Observer
 from warpslam.runs.folder import RunFolder
 from warpslam.runtime.environment import resident_bytes
 
 if TYPE_CHECKING:
     from warpslam.runs.record import Progress
+    from warpslam.runtime.compilation import ModuleProgress
 
 log = logging.getLogger(__name__)
 HARD_FACTOR = 1.25
@@ -66,7 +68,7 @@ def execute(job: Job, output: Path, report: Report, memory_gb: float | None = No
     has_same_settings = state.fields.get("settings") == job.settings_hash
     if not has_same_settings:
         # Before the state file says otherwise: the next process would take them for its own.
-        remove_checkpoints(RunFolder(output / job.name))
+        RunFolder(output / job.name).remove_checkpoints()
     if not has_same_settings or state.fields.get("status") != RUNNING:
         state.fields.clear()
     elif state.fields.get("ending") == MEMORY:
@@ -97,37 +99,34 @@ def execute(job: Job, output: Path, report: Report, memory_gb: float | None = No
 
 def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) -> tuple[str, str]:
     """Status and message."""
-    from warpslam.config import Config
-    from warpslam.evaluation import load_mesh
-    from warpslam.pipeline.finished import open_source
-    from warpslam.pipeline.methods import has_checkpoints
+    # Warp and torch are loaded once the cores of this process are set.
     from warpslam.pipeline.run import run
-    from warpslam.pipeline.setup import load_kernels
-    from warpslam.runs.request import Source
-    from warpslam.runtime.kernel_cache import kernel_cache_errors
 
-    source = Source(job.path, job.dataset, job.camera)
-    sequence = open_source(source)
-    config = Config.from_preset(job.preset or sequence.preset, list(job.overrides))
-    config = config.with_files(job.decoders, job.poses)
-    truth_mesh = load_mesh(job.truth_mesh) if job.truth_mesh else None
-    device = job.device or _device_of(slot)
-    with kernel_cache_errors():
-        load_kernels(sequence, device)
-    report({"compiled": True})
+    request = job.request
+    job = job.asking(
+        device=request.device or _device_of(slot),
+        checkpoint_every=request.checkpoint_every if has_checkpoints(request.method) else None,
+    )
+    result = run(job.request, folder, observer=_Reporter(report, watch), go_on=True)
+    anew = result.metrics.started_anew
+    message = f"started from the beginning: {anew}" if anew else ""
+    return result.status, message
 
-    def on_frame(progress: Progress) -> None:
-        report({"done": progress.done, "total": progress.total, "ate_rmse": progress.ate_rmse, "fps": progress.fps})
-        watch.check()
 
-    result = run(
-        sequence, config, folder, frames=slice(*job.frames), device=device, seed=job.seed, source=source,
-        truth_mesh=truth_mesh, on_frame=on_frame, method=job.method, poses=job.poses,
-        checkpoint_every=job.checkpoint_every if has_checkpoints(job.method) else None, go_on=True,
-    )  # fmt: skip
-    message = result.metrics.get("started_anew", "")
-    message = f"started from the beginning: {message}" if message else ""
-    return INTERRUPTED if result.status == "interrupted" else FINISHED, message
+class _Reporter(Observer):
+    """Passes on what the run tells of itself, and ends a run that takes too much memory."""
+
+    def __init__(self, report: Report, watch: MemoryWatch) -> None:
+        self.report, self.watch = report, watch
+
+    def module(self, progress: ModuleProgress) -> None:
+        if progress.done == progress.total:
+            self.report({"compiled": True})
+
+    def frame(self, progress: Progress) -> None:
+        news = {"done": progress.done, "total": progress.total, "ate_rmse": progress.ate_rmse, "fps": progress.fps}
+        self.report(news)
+        self.watch.check()
 
 
 def _device_of(slot: int) -> str | None:

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from warpslam.errors import DatasetError
+from warpslam.frames import FrameStatus
 from warpslam.runs.folder import RunFolder
+from warpslam.runs.metrics import RunMetrics
 from warpslam.storage.json_files import read_json
 from warpslam.storage.tum import read_tum
 
@@ -23,25 +25,24 @@ def read_figures(folder: RunFolder) -> dict[str, float]:
     Raises:
         DatasetError: A file is missing or damaged.
     """
-    metrics, timing = read_json(folder.metrics), read_json(folder.timing)
-    surface = metrics.get("reconstruction", {})
-    size = metrics.get("map") or {}
+    metrics, timing = RunMetrics.read(folder.metrics), read_json(folder.timing)
+    surface = metrics.reconstruction
     figures = {
-        "accuracy": _scaled(surface.get("accuracy_m"), 100),
-        "completion": _scaled(surface.get("completion_m"), 100),
-        "ratio": _scaled(surface.get("completion_ratio_5cm"), 100),
-        "depth_l1": _scaled(surface.get("depth_l1_m"), 100),
-        "memory": _scaled(size.get("bytes"), 1e-6),
-        "flops": _scaled(size.get("flops_per_point"), 1e-3),
-        "ate": _scaled(metrics.get("ate_m", {}).get("aligned", {}).get("rmse"), 100),
+        "accuracy": _scaled(surface.accuracy_m, 100),
+        "completion": _scaled(surface.completion_m, 100),
+        "ratio": _scaled(surface.completion_ratio_5cm, 100),
+        "depth_l1": _scaled(surface.depth_l1_m, 100),
+        "memory": _scaled(metrics.map.bytes, 1e-6),
+        "flops": _scaled(metrics.map.flops_per_point, 1e-3),
+        "ate": _scaled(metrics.ate_m.aligned.rmse, 100),
         "tracking": _mean_milliseconds(timing, "tracking"),
         "mapping": _mean_milliseconds(timing, "mapping"),
     }
     return {key: value for key, value in figures.items() if value is not None}
 
 
-def _scaled(value: Any, factor: float) -> float | None:
-    return None if value is None else factor * float(value)
+def _scaled(value: float | None, factor: float) -> float | None:
+    return None if value is None else factor * value
 
 
 def _mean_milliseconds(timing: dict[str, Any], phase: str) -> float | None:
@@ -65,7 +66,7 @@ def gap_figures(folder: RunFolder) -> dict[str, float]:
     statuses = _statuses(folder.frames)
     if len(statuses) != len(times):
         raise DatasetError(f"{folder.frames}: has {len(statuses)} frames, and {folder.trajectory.name} {len(times)}")
-    usable = np.flatnonzero(statuses != "SKIPPED")
+    usable = np.flatnonzero(statuses != FrameStatus.SKIPPED)
     steps = np.diff(times[usable])
     if len(steps) < 2 or steps.max() < MIN_GAP * np.median(steps):
         raise DatasetError(f"{folder.path}: no gap: no time without a usable frame stands out")
@@ -73,7 +74,7 @@ def gap_figures(folder: RunFolder) -> dict[str, float]:
     known = {round(time, 4): pose for time, pose in zip(truth_times, truth, strict=True)}
     true_pose = np.array([known.get(round(times[i], 4), np.full((4, 4), np.nan)) for i in usable])
     is_known = np.isfinite(true_pose).all(axis=(1, 2))
-    reference = np.flatnonzero(is_before & is_known & (statuses[usable] == "OK"))
+    reference = np.flatnonzero(is_before & is_known & (statuses[usable] == FrameStatus.OK))
     after = ~is_before & is_known
     if not len(reference) or not after.any():
         raise DatasetError(f"{folder.path}: no true pose is known of a frame before the gap and one after it")
@@ -81,7 +82,7 @@ def gap_figures(folder: RunFolder) -> dict[str, float]:
     T = true_pose[reference[-1]] @ np.linalg.inv(poses[usable[reference[-1]]])
     aligned = poses[usable][after][:, :3, 3] @ T[:3, :3].T + T[:3, 3]
     errors = np.linalg.norm(aligned - true_pose[after][:, :3, 3], axis=1)
-    lost = statuses[usable][~is_before] == "LOST"
+    lost = statuses[usable][~is_before] == FrameStatus.LOST
     return {"after_gap": 100 * float(np.sqrt((errors**2).mean())), "lost_after_gap": 100 * float(lost.mean())}
 
 

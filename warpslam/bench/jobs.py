@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,8 +12,9 @@ from pathlib import Path
 from warpslam.batch.jobs import Job
 from warpslam.bench.studies import Study, Variant
 from warpslam.bench.suite import Rendering, SequenceSpec, StudySpec, Suite
+from warpslam.camera import Intrinsics
 from warpslam.runs.folder import as_file_name
-from warpslam.runs.request import parse_slice
+from warpslam.runs.request import ALL_FRAMES, RunRequest, Source, parse_slice
 from warpslam.storage.json_files import read_json, write_json
 
 RENDERED = "rendered"
@@ -22,16 +24,15 @@ _MARK = "rendering.json"
 
 @dataclass(frozen=True)
 class Entry:
-    """What a study asks of one run.
-
-    study, sequence, variant, seed: Where its figures go. job: The run, which other entries may share.
-    """
+    """What a study asks of one run; all but the last say where its figures go."""
 
     study: Study
     sequence: str
     variant: Variant
     seed: int
+
     job: Job
+    """The run, which other entries may share."""
 
 
 def expand(suite: Suite, output: Path, studies: Iterable[str] | None = None) -> list[Entry]:
@@ -54,7 +55,7 @@ def expand(suite: Suite, output: Path, studies: Iterable[str] | None = None) -> 
         for seed in spec.seeds or suite.spec.seeds
     ]
     # The true surface changes nothing in a run but which figures it has: a run with it serves those without.
-    with_truth = {replace(entry.job, truth_mesh=None): entry.job for entry in entries if entry.job.truth_mesh}
+    with_truth = {e.job.asking(truth_mesh=None): e.job for e in entries if e.job.request.truth_mesh is not None}
     return [replace(entry, job=with_truth.get(entry.job, entry.job)) for entry in entries]
 
 
@@ -84,22 +85,19 @@ def _job(
     if study.given_poses and poses is None:
         overrides.append("tracking.use_given_poses=true")
     frames = spec.frames or sequence.frames
-    job = Job(
-        name="",
-        path=path,
-        dataset=sequence.dataset,
-        camera=sequence.camera,
+    request = RunRequest(
+        source=Source(path, sequence.dataset, sequence.camera),
+        frames=parse_slice(frames) if frames is not None else ALL_FRAMES,
         preset=sequence.preset,
-        frames=parse_slice(frames) if frames is not None else (None, None, None),
         overrides=_last_values([*overrides, *variant.overrides]),
         decoders=suite.resolve(sequence.decoders),
         device=suite.spec.device,
         seed=seed,
-        truth_mesh=truth_mesh if study.needs_truth_mesh else None,
         method=variant.method,
         poses=poses,
+        truth_mesh=truth_mesh if study.needs_truth_mesh else None,
     )
-    return replace(job, name=as_file_name(f"{name}-{variant.method}-{_digest(job)}-seed{seed}"))
+    return Job(as_file_name(f"{name}-{variant.method}-{_digest(request)}-seed{seed}"), request)
 
 
 def _last_values(overrides: list[str]) -> tuple[str, ...]:
@@ -108,9 +106,10 @@ def _last_values(overrides: list[str]) -> tuple[str, ...]:
     return tuple(last[key] for key in sorted(last))
 
 
-def _digest(job: Job) -> str:
+def _digest(request: RunRequest) -> str:
     """Of the settings; not of folders, so that names stay when data moves, nor of the seed, which is in the name."""
-    fields = [job.preset, job.frames, job.overrides, job.poses is not None, job.decoders is not None]
+    is_given = [request.poses is not None, request.decoders is not None]
+    fields = [request.preset, request.frames, request.overrides, *is_given]
     return hashlib.sha256(json.dumps(fields).encode()).hexdigest()[:8]
 
 
@@ -121,9 +120,7 @@ def rendered_folder(output: Path, name: str, rendering: Rendering) -> Path:
 
 def render_missing(suite: Suite, output: Path, entries: Iterable[Entry]) -> list[Path]:
     """Render the synthetic sequences that are needed and not there yet; returns their folders."""
-    import shutil
-
-    from warpslam.camera import Intrinsics
+    # The renderer loads Warp, which a bench of recordings does not need in this process.
     from warpslam.synthetic import make_sequence, write_sequence
 
     made = []

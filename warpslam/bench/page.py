@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import base64
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 import yaml
 
-from warpslam.bench.results import Direction, StudyResult
+from warpslam.bench.results import Bench, Direction, StudyResult
 from warpslam.bench.tables import bench_facts, header, how_to_read, made_with, plot_path, table_rows, trouble
 from warpslam.report.page import Html, element, figures, join, missing, page, section, table, void, write_page
-
-if TYPE_CHECKING:
-    from warpslam.bench.results import Bench
 
 
 def write_bench_page(bench: Bench) -> Path:

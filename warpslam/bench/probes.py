@@ -3,19 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 
 from warpslam.batch.jobs import Job
-from warpslam.errors import DatasetError
+from warpslam.errors import ConfigError, DatasetError
+from warpslam.field.decoder_files import load_decoders
+from warpslam.field.rendering import render_image
+from warpslam.frames import FrameStatus, read_images
+from warpslam.mapping.frustum import measured_extent, select_in_frustum
+from warpslam.mapping.mapper import Mapper
+from warpslam.pipeline.setup import load_kernels, open_source, select_frames
+from warpslam.poses import orthonormalized
+from warpslam.runs.given_poses import GivenPoses
+from warpslam.scene.feature_grid import FeatureGrid
+from warpslam.scene.image_pool import ImagePool
+from warpslam.scene.scene_map import SceneMap
+from warpslam.slam import Slam
 from warpslam.storage.json_files import read_json, write_json
 
 if TYPE_CHECKING:
     from warpslam.config import Config
-    from warpslam.scene.feature_grid import FeatureGrid
     from warpslam.sequences.base import Frame, RgbdSequence
 
 PROBE_FOLDER = "probes"
@@ -52,30 +65,19 @@ def convergence(job: Job) -> dict[str, Any]:
     Returns:
         ``figures``: "view_depth" at the end [cm]. ``curve``: [iteration, depth L1 [cm]] of about 25 moments.
     """
-    import warp as wp
-
-    from warpslam.field.decoder_files import load_decoders
-    from warpslam.field.rendering import render_image
-    from warpslam.frames import read_images
-    from warpslam.mapping.frustum import measured_extent
-    from warpslam.mapping.mapper import Mapper
-    from warpslam.poses import orthonormalized
-    from warpslam.scene.image_pool import ImagePool
-    from warpslam.scene.scene_map import SceneMap
-
     sequence, config, frames = _open(job)
     first = next(frames, None)
     if first is None:
         raise DatasetError(f"{sequence.name}: none of the selected frames has a pose")
     frame, T_world_camera = first
-    camera, device = sequence.intrinsics, wp.get_device(job.device)
+    camera, device = sequence.intrinsics, wp.get_device(job.request.device)
     rgb, depth = read_images(frame.rgb, frame.depth, camera, config.grid.max_depth, None)
-    scene = SceneMap(load_decoders(config.decoders), config.grid, device, job.seed)
+    scene = SceneMap(load_decoders(config.decoders), config.grid, device, job.request.seed)
     scene.cover(*measured_extent(depth, T_world_camera, camera))
     images = ImagePool(camera, device)
     images.set(0, rgb, depth)
     mapping = config.mapping.model_copy(update={"coarse": False})
-    mapper = Mapper(scene, camera, mapping, config.sampling, device, job.seed)
+    mapper = Mapper(scene, camera, mapping, config.sampling, device, job.request.seed)
     stride = -(-camera.width // 160)
     measured = depth[::stride, ::stride]
     valid = measured > 0
@@ -104,18 +106,10 @@ def outside_change(job: Job) -> dict[str, Any]:
         ``figures``: "outside", the largest change of a feature's component. ``levels``: The same by level, and the
         share of the vertices outside that changed.
     """
-    import warp as wp
-
-    from warpslam.frames import read_images
-    from warpslam.mapping.frustum import select_in_frustum
-    from warpslam.scene.feature_grid import FeatureGrid
-    from warpslam.scene.image_pool import ImagePool
-    from warpslam.slam import Slam
-
     sequence, config, frames = _open(job)
     config = config.updated(["tracking.use_given_poses=true"])
-    camera, device = sequence.intrinsics, wp.get_device(job.device)
-    slam = Slam(camera, config, job.device, job.seed)
+    camera, device = sequence.intrinsics, wp.get_device(job.request.device)
+    slam = Slam(camera, config, job.request.device, job.request.seed)
     images = ImagePool(camera, device)
     levels = {level: {"largest": 0.0, "changed": 0, "outside": 0} for level in ("middle", "fine", "color")}
     every = config.mapping.every
@@ -130,7 +124,7 @@ def outside_change(job: Job) -> dict[str, Any]:
         before = {} if number == 0 else {level: snapshot(level) for level in levels}
         result = slam.step(frame.rgb, frame.depth, frame.timestamp, T_world_camera)
         slam.wait()
-        if number % every or number == 0 or result.status != "OK":
+        if number % every or number == 0 or result.status != FrameStatus.OK:
             continue
         # The depth as the mapper has it, rounded.
         images.set(0, *read_images(frame.rgb, frame.depth, camera, config.grid.max_depth, None))
@@ -157,19 +151,17 @@ PROBES: dict[str, Callable[[Job], dict[str, Any]]] = {"convergence": convergence
 
 def _open(job: Job) -> tuple[RgbdSequence, Config, Iterator[tuple[Frame, np.ndarray]]]:
     """Sequence, settings, and those of the selected frames that have a pose, with it."""
-    from warpslam.config import Config
-    from warpslam.pipeline.finished import open_source
-    from warpslam.pipeline.setup import load_kernels, select_frames
-    from warpslam.runs.given_poses import GivenPoses
-    from warpslam.runs.request import Source
-
-    sequence = open_source(Source(job.path, job.dataset, job.camera))
-    config = Config.from_preset(job.preset or sequence.preset, list(job.overrides)).with_files(job.decoders, None)
-    load_kernels(sequence, job.device)
-    given = None if job.poses is None else GivenPoses.read(job.poses)
+    request = job.request
+    if request.source is None:
+        raise ConfigError(f"{job.name} names no sequence")
+    sequence = open_source(request.source)
+    # Poses are used here, not given to tracking: what the settings say of it stays as it is.
+    config = replace(request, poses=None).settings(sequence.preset)
+    load_kernels(sequence, request.device)
+    given = None if request.poses is None else GivenPoses.read(request.poses)
 
     def frames() -> Iterator[tuple[Frame, np.ndarray]]:
-        for index in select_frames(sequence, slice(*job.frames)):
+        for index in select_frames(sequence, slice(*request.frames)):
             frame = sequence[index]
             pose = frame.T_world_camera if given is None else given.at(frame.timestamp)
             if pose is not None and np.isfinite(pose).all():

@@ -17,40 +17,51 @@ from warpslam.runs.folder import RunFolder
 
 @dataclass(frozen=True)
 class Outcome:
-    """One run as one study sees it.
-
-    run: Its folder's name. status: As in `warpslam.batch.JobStatus`; "finished" also if it was done before.
-    message: Why it did not finish, or why a figure of it is missing. lost: Frames without a pose. frames: Frames.
-    figures: By key. protocol: Culling protocol of its reconstruction figures. curve: Of the study's probe.
-    """
+    """One run as one study sees it."""
 
     run: str
+    """Its folder's name."""
+
     seed: int
     status: str
+    """As in `warpslam.batch.status.JobStatus`; "finished" also if it was done before."""
+
     message: str = ""
+    """Why it did not finish, or why a figure of it is missing."""
+
     lost: int = 0
+    """Frames without a pose."""
+
     frames: int = 0
+    """Frames that were selected."""
+
     figures: Mapping[str, float] = field(default_factory=dict)
+    """By key of `warpslam.bench.studies.METRICS`."""
+
     protocol: str | None = None
+    """Culling protocol of its reconstruction figures."""
+
     curve: Sequence[Sequence[float]] | None = None
+    """Of the study's probe."""
 
     @property
     def is_finished(self) -> bool:
         """Whether it has its results."""
-        return self.status == "finished"
+        return self.status == FINISHED
 
 
 @dataclass(frozen=True)
 class Summary:
-    """A figure over seeds.
-
-    mean: None without any value. std: Sample standard deviation; None of fewer than two values. values: Of the runs
-    that have one.
-    """
+    """A figure over seeds."""
 
     mean: float | None
+    """None without any value."""
+
     std: float | None
+    """Sample standard deviation; None of fewer than two values."""
+
     values: tuple[float, ...]
+    """Of the runs that have one."""
 
     @classmethod
     def of(cls, values: Iterable[float]) -> Summary:
@@ -114,19 +125,23 @@ class Row:
 
 @dataclass(frozen=True)
 class Direction:
-    """Whether an expectation holds.
-
-    better, worse: Mean over the sequences on which both sides have the figure. holds: None if nothing can be said.
-    is_clear: Whether the difference exceeds both spreads over seeds on every sequence; None where no spread is known.
-    reason: Why nothing can be said, or what to bear in mind.
-    """
+    """Whether an expectation holds."""
 
     expectation: Expectation
     holds: bool | None
+    """None if nothing can be said."""
+
     better: float | None = None
+    """Mean over the sequences on which both sides have the figure."""
+
     worse: float | None = None
+    """The same of the other side."""
+
     is_clear: bool | None = None
+    """Whether the difference exceeds both spreads over seeds on every sequence; None where no spread is known."""
+
     reason: str = ""
+    """Why nothing can be said, or what to bear in mind."""
 
     @property
     def text(self) -> str:
@@ -270,18 +285,25 @@ RUNS = "runs"
 
 @dataclass(frozen=True)
 class Bench:
-    """A bench that was run, as far as it came.
-
-    suite: What was run. folder: Where. command: How it was started, if by the command line.
-    jobs, statuses: Its runs and how they ended. results: By study.
-    """
+    """A bench that was run, as far as it came."""
 
     suite: Suite
+    """What was run."""
+
     folder: Path
+    """Where its files and runs are."""
+
     command: str | None
+    """How it was started, if by the command line."""
+
     jobs: tuple[Job, ...]
+    """Its runs."""
+
     statuses: tuple[JobStatus, ...]
+    """How they ended."""
+
     results: tuple[StudyResult, ...]
+    """By study."""
 
     def run_folder(self, run: str) -> RunFolder:
         """Folder of one of its runs."""

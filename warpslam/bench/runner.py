@@ -10,11 +10,14 @@ from warpslam.batch.local import run_batch
 from warpslam.batch.status import FINISHED, INTERRUPTED, SKIPPED, JobStatus, Update
 from warpslam.bench.figures import gap_figures, read_figures
 from warpslam.bench.jobs import Entry, expand, render_missing, unique_jobs
+from warpslam.bench.page import write_bench_page
 from warpslam.bench.results import RUNS, Bench, Outcome, Row, StudyResult, published_row
 from warpslam.bench.suite import Suite
+from warpslam.bench.tables import write_tables
 from warpslam.errors import WarpSlamError
 from warpslam.runs.folder import RunFolder
-from warpslam.storage.json_files import read_json
+from warpslam.runs.metrics import RunMetrics
+from warpslam.storage.writing import output_error
 
 Say = Callable[[str], None]
 
@@ -46,10 +49,6 @@ def run_bench(
         ConfigError: A study is not part of the suite, or a setting can't work.
         OutputError: The folder can't be written to.
     """
-    from warpslam.bench.page import write_bench_page
-    from warpslam.bench.tables import write_tables
-    from warpslam.storage.writing import output_error
-
     output, say = Path(output), say or (lambda text: None)
     entries = expand(suite, output, None if studies is None else list(studies))
     jobs = unique_jobs(entries)
@@ -100,16 +99,17 @@ def _outcome(entry: Entry, output: Path, status: JobStatus, say: Say | None) -> 
     folder = RunFolder(output / RUNS / job.name)
     try:
         figures = read_figures(folder)
-        surface = read_json(folder.metrics).get("reconstruction", {})
+        surface = RunMetrics.read(folder.metrics).reconstruction
         if study.needs_truth_mesh:
-            protocol = surface.get("protocol")
-            messages += [f"no reconstruction figures: {surface['error']}"] if "error" in surface else []
+            protocol = surface.protocol
+            messages += [f"no reconstruction figures: {surface.error}"] if surface.error is not None else []
     except WarpSlamError as error:
         messages.append(str(error))
     try:
         if "after_gap" in {metric.key for metric in study.metrics}:
             figures |= gap_figures(folder)
         if study.probe is not None and say is not None:
+            # Loads Warp and torch, which no bench without probes needs in this process.
             from warpslam.bench.probes import measure
 
             say(f"{study.name}: {study.probe} of {entry.sequence}, {entry.variant.name}, seed {entry.seed}")

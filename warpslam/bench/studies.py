@@ -9,23 +9,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from warpslam.field.complexity import field_flops
-from warpslam.pipeline.methods import DEFAULT_METHOD
+from warpslam.runs.request import DEFAULT_METHOD
 
 
 @dataclass(frozen=True)
 class Metric:
-    """A figure of a run.
-
-    key: Name in files. title, unit: As shown. digits: After the point. lower_is_better: Which way is better.
-    is_reconstruction: Holds under a culling protocol, and needs the true surface.
-    """
+    """A figure of a run."""
 
     key: str
+    """Name in files."""
+
     title: str
     unit: str
     digits: int = 2
+    """After the point."""
+
     lower_is_better: bool = True
     is_reconstruction: bool = False
+    """Holds under a culling protocol, and needs the true surface."""
 
     @property
     def heading(self) -> str:
@@ -56,18 +57,22 @@ METRICS = {
 
 @dataclass(frozen=True)
 class Variant:
-    """One thing that a study compares.
-
-    name: As shown. overrides: Settings ``group.field=value``. method: Of `warpslam.pipeline.methods.METHODS`.
-    position: Where a curve over the variants has it.
-    figures: What is known without a run and takes the place of the run's figure.
-    """
+    """One thing that a study compares."""
 
     name: str
+    """As shown."""
+
     overrides: tuple[str, ...] = ()
+    """Settings ``group.field=value``."""
+
     method: str = DEFAULT_METHOD
+    """Of `warpslam.pipeline.methods.METHODS`."""
+
     position: float | None = None
+    """Where a curve over the variants has it."""
+
     figures: Mapping[str, float] = field(default_factory=dict)
+    """What is known without a run and takes the place of the run's figure."""
 
 
 @dataclass(frozen=True)
@@ -82,24 +87,31 @@ class Expectation:
 
 @dataclass(frozen=True)
 class Study:
-    """A comparison of variants on the same sequences.
-
-    name: In suites and file names. source: Where the paper has it. text: What is compared and how.
-    given_poses: The true poses are given; otherwise the camera is tracked.
-    probe: Measured besides the runs, see `warpslam.bench.probes`.
-    axis: What `Variant.position` is, of a study that is drawn as curves.
-    """
+    """A comparison of variants on the same sequences."""
 
     name: str
+    """In suites and file names."""
+
     title: str
+    """As shown."""
+
     source: str
+    """Where the paper has it."""
+
     text: str
+    """What is compared and how."""
+
     variants: tuple[Variant, ...]
     metrics: tuple[Metric, ...]
     expectations: tuple[Expectation, ...] = ()
     given_poses: bool = False
+    """The true poses are given; otherwise the camera is tracked."""
+
     probe: str | None = None
+    """Measured besides the runs, see `warpslam.bench.probes`."""
+
     axis: str | None = None
+    """What `Variant.position` is, of a study that is drawn as curves."""
 
     @property
     def needs_truth_mesh(self) -> bool:

@@ -92,16 +92,19 @@ class SuiteSpec(_Section):
 
 @dataclass(frozen=True)
 class Suite:
-    """A suite that has been read and checked.
-
-    name: Of the file, without its ending. bases: Folders that its paths are looked for in, one after the other.
-    source: File, or "shipped".
-    """
+    """A suite that has been read and checked."""
 
     name: str
+    """Of the file, without its ending."""
+
     spec: SuiteSpec
+    """Its content."""
+
     bases: tuple[Path, ...]
+    """Folders that its paths are looked for in, one after the other."""
+
     source: str
+    """The file, or ``shipped``."""
 
     def studies(self, wanted: Iterable[str] | None = None) -> list[tuple[Study, StudySpec]]:
         """Its studies in the order of `STUDIES`, or those of them that are wanted.

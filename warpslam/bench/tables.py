@@ -5,15 +5,14 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from warpslam import __version__
-from warpslam.bench.results import Row, StudyResult, to_dict
+from warpslam.bench.plots import plot_study
+from warpslam.bench.results import Bench, Row, StudyResult, to_dict
 from warpslam.bench.studies import Metric
-from warpslam.storage.json_files import read_json, write_json
-
-if TYPE_CHECKING:
-    from warpslam.bench.results import Bench
+from warpslam.runs.metrics import RunMetrics
+from warpslam.storage.json_files import write_json
 
 PAPER = "paper"
 """What marks the rows of published figures."""
@@ -25,8 +24,6 @@ def write_tables(bench: Bench) -> None:
     Raises:
         OSError: One can't be written.
     """
-    from warpslam.bench.plots import plot_study
-
     facts = bench_facts(bench)
     write_json(
         bench.folder / "bench.json",
@@ -49,10 +46,11 @@ def bench_facts(bench: Bench) -> dict[str, Any]:
     versions: dict[str, set[str]] = {}
     for job in bench.jobs:
         file = bench.run_folder(job.name).metrics
-        metrics = read_json(file) if file.is_file() else {}
+        metrics = RunMetrics.read(file) if file.is_file() else RunMetrics()
         for name, values in found.items():
-            values.update([str(metrics[name])] if metrics.get(name) is not None else [])
-        for package, version in (metrics.get("versions") or {}).items():
+            value = getattr(metrics, name)
+            values.update([] if value is None else [str(value)])
+        for package, version in metrics.versions.items():
             versions.setdefault(package, set()).update([version] if version else [])
     statuses = [status.status for status in bench.statuses]
     spec = bench.suite.spec
@@ -62,7 +60,7 @@ def bench_facts(bench: Bench) -> dict[str, Any]:
         "suite_source": bench.suite.source,
         "description": spec.description,
         "command": bench.command,
-        "seeds": sorted({job.seed for job in bench.jobs}),
+        "seeds": sorted({job.request.seed for job in bench.jobs}),
         "devices": sorted(found["device"]),
         "platforms": sorted(found["platform"]),
         "processors": sorted(found["processors"]),

@@ -10,20 +10,28 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from warpslam.batch import local
+from warpslam.batch.jobs import Job, with_free_names
+from warpslam.batch.manifest import read_manifest
+from warpslam.batch.status import INTERRUPTED, RUNNING, WAITING, JobStatus
+from warpslam.batch.summary import COLUMNS, cells, first_line, is_good, write_summary
 from warpslam.cli.common import (
     EXIT_INTERRUPTED,
     add_command,
+    add_config_option,
     add_format_options,
     add_method_option,
     add_run_options,
     parse_frames,
+    read_config,
+    slice_of,
 )
+from warpslam.report.text import duration
+from warpslam.runs.request import RunRequest, Source
+from warpslam.storage.writing import output_error
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from warpslam.batch.jobs import Job
-    from warpslam.batch.status import JobStatus
 
 EXIT_UNFINISHED = 1
 CHECKPOINT_EVERY = 50
@@ -40,7 +48,8 @@ def add(commands: Any) -> None:
     batch.add_argument("--cluster", metavar="ADDRESS", help="run on Ray: ray://HOST:10001, or local")
     add_format_options(batch)
     batch.add_argument("--preset", help="settings to start from (default: each dataset's)")
-    batch.add_argument("--frames", type=parse_frames, default=slice(None), metavar="A:B:STEP", help="frames to use")
+    add_config_option(batch)
+    batch.add_argument("--frames", type=parse_frames, metavar="A:B:STEP", help="frames to use")
     add_method_option(batch)
     batch.add_argument(
         "--checkpoint-every", type=int, default=CHECKPOINT_EVERY, metavar="N",
@@ -50,17 +59,11 @@ def add(commands: Any) -> None:
 
 
 def _batch(options: argparse.Namespace) -> int:
-    from warpslam.batch.local import run_batch
-    from warpslam.batch.status import INTERRUPTED
-    from warpslam.batch.summary import is_good, write_summary
-
     jobs = _jobs(options)
     output = Path(options.output or "batch")
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        from warpslam.storage.writing import output_error
-
         raise output_error(error, output) from error
     with progress() as on_update:
         if options.cluster:
@@ -72,7 +75,7 @@ def _batch(options: argparse.Namespace) -> int:
             )  # fmt: skip
         else:
             workers = 1 if options.workers is None else options.workers
-            statuses = run_batch(jobs, output, workers=workers, memory_gb=options.memory_gb, on_update=on_update)
+            statuses = local.run_batch(jobs, output, workers=workers, memory_gb=options.memory_gb, on_update=on_update)
     paths = write_summary(statuses, output)
     _print_table(statuses)
     print(f"written to  {paths[0]}, {paths[1]}")
@@ -82,18 +85,23 @@ def _batch(options: argparse.Namespace) -> int:
 
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
-    from warpslam.batch.jobs import Job, with_free_names
-    from warpslam.batch.manifest import read_manifest
-
-    frames = options.frames
-    common = Job(
-        name="", path="", dataset=options.dataset, camera=options.camera, preset=options.preset,
-        frames=(frames.start, frames.stop, frames.step), overrides=tuple(options.overrides),
-        decoders=str(Path(options.decoders).resolve()) if options.decoders else None, device=options.device,
-        seed=options.seed, method=options.method, checkpoint_every=options.checkpoint_every or None,
-    )  # fmt: skip
+    request = RunRequest(
+        source=Source("", options.dataset, options.camera),
+        frames=slice_of(options.frames),
+        config=read_config(options),
+        preset=options.preset,
+        overrides=tuple(options.overrides),
+        decoders=str(Path(options.decoders).resolve()) if options.decoders else None,
+        device=options.device,
+        seed=options.seed,
+        method=options.method,
+        checkpoint_every=options.checkpoint_every or None,
+    )
+    common = Job("", request)
     paths = [Path(folder).expanduser().resolve() for folder in options.folders]
-    jobs = [replace(common, name=path.name, path=str(path)) for path in paths]
+    jobs = [
+        Job(path.name, replace(request, source=Source(str(path), options.dataset, options.camera))) for path in paths
+    ]
     if options.manifest:
         jobs += read_manifest(options.manifest, common)
     return with_free_names(jobs)
@@ -127,8 +135,6 @@ class _Lines:
 
     def show(self, status: JobStatus) -> None:
         """Print, if there is something new."""
-        from warpslam.batch.summary import first_line
-
         tenth = _LINES_A_JOB * status.done // status.total if status.total else 0
         if self._last.get(status.name) == (status.status, tenth):
             return
@@ -149,9 +155,6 @@ def _table(statuses: Sequence[JobStatus]) -> Any:
     from rich.table import Table
     from rich.text import Text
 
-    from warpslam.batch.status import RUNNING, WAITING
-    from warpslam.batch.summary import COLUMNS, cells, is_good
-
     table = Table()
     for number, column in enumerate(COLUMNS):
         table.add_column(column, justify="right" if 2 <= number <= 7 else "left", overflow="fold")
@@ -165,8 +168,6 @@ def _table(statuses: Sequence[JobStatus]) -> Any:
 
 def _print_table(statuses: Sequence[JobStatus]) -> None:
     from rich.console import Console
-
-    from warpslam.report.text import duration
 
     # Where there is no terminal rich assumes 80 columns, which would fold every cell.
     Console(width=None if sys.stdout.isatty() else 160).print(_table(statuses))

@@ -9,9 +9,11 @@ from contextlib import contextmanager
 from typing import Any
 
 from warpslam.cli.exit_codes import EXIT_INTERRUPTED as EXIT_INTERRUPTED
+from warpslam.config import Config
 from warpslam.errors import ConfigError
 from warpslam.pipeline.methods import DEFAULT_METHOD, METHODS
-from warpslam.runs.request import parse_slice
+from warpslam.runs.metrics import Reconstruction, Rendering
+from warpslam.runs.request import ALL_FRAMES, Slice, parse_slice
 
 
 def add_command(commands: Any, name: str, function: Callable[[argparse.Namespace], int], text: str) -> Any:
@@ -62,6 +64,29 @@ def add_method_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--method", choices=METHODS, default=DEFAULT_METHOD, help=f"what runs ({DEFAULT_METHOD})")
 
 
+def add_config_option(parser: argparse.ArgumentParser) -> None:
+    """A file of settings in place of a preset."""
+    parser.add_argument("--config", metavar="FILE", help="settings to start from, such as the config.yaml of a run")
+
+
+def read_config(options: argparse.Namespace) -> Config | None:
+    """The settings of ``--config``; None without.
+
+    Raises:
+        ConfigError: The file can't be read, a field of it does not fit, or there is a preset as well.
+    """
+    if options.config is None:
+        return None
+    if options.preset:
+        raise ConfigError("--config does not go with --preset: the file has all settings; use --set on top of it")
+    return Config.load(options.config)
+
+
+def slice_of(frames: slice | None) -> Slice:
+    """The parts of ``--frames``; None is for all."""
+    return ALL_FRAMES if frames is None else (frames.start, frames.stop, frames.step)
+
+
 def parse_frames(text: str) -> slice:
     """A slice of frames from A:B or A:B:STEP."""
     try:
@@ -86,30 +111,28 @@ def warnings_on_stderr() -> Iterator[None]:
         logger.removeHandler(handler)
 
 
-def print_reconstruction(*protocols: dict[str, Any]) -> None:
-    """Print a table of reconstruction metrics, a line for each protocol, from what `reconstruction_metrics` gives."""
+def print_reconstruction(*protocols: Reconstruction) -> None:
+    """Print a table of reconstruction metrics, a line for each protocol."""
     columns = ("accuracy", "completion", "< 5 cm", "F-score", "normals", "depth L1", "missed")
     print(f"{'surface':26}" + "".join(f"{name:>12}" for name in columns))
     for figures in protocols:
-        views = figures.get("virtual_views", {})
         cells = [
-            _scaled(figures["accuracy_m"], 100, "cm"),
-            _scaled(figures["completion_m"], 100, "cm"),
-            _scaled(figures["completion_ratio_5cm"], 100, "%"),
-            _scaled(figures["f_score_5cm"], 100, "%"),
-            _scaled(figures["normal_consistency"], 1, ""),
-            _scaled(figures.get("depth_l1_m"), 100, "cm"),
-            _scaled(views.get("missed_share"), 100, "%"),
+            _scaled(figures.accuracy_m, 100, "cm"),
+            _scaled(figures.completion_m, 100, "cm"),
+            _scaled(figures.completion_ratio_5cm, 100, "%"),
+            _scaled(figures.f_score_5cm, 100, "%"),
+            _scaled(figures.normal_consistency, 1, ""),
+            _scaled(figures.depth_l1_m, 100, "cm"),
+            _scaled(figures.virtual_views.missed_share, 100, "%"),
         ]
-        print(f"{figures['protocol']:26}" + "".join(f"{cell:>12}" for cell in cells))
+        print(f"{figures.protocol or '-':26}" + "".join(f"{cell:>12}" for cell in cells))
 
 
-def print_rendering(figures: dict[str, Any]) -> None:
-    """Print what `rendering_metrics` gives."""
-    ssim = _scaled(figures["ssim"], 1, "")
+def print_rendering(figures: Rendering) -> None:
+    """Print how alike renderings and input are."""
     print(
-        f"rendering   depth L1 {100 * figures['depth_l1_m']:.2f} cm, PSNR {figures['psnr_db']:.1f} dB, SSIM {ssim}, "
-        f"{len(figures['frames'])} frames"
+        f"rendering   depth L1 {_scaled(figures.depth_l1_m, 100, 'cm')}, PSNR {figures.psnr_db:.1f} dB, "
+        f"SSIM {_scaled(figures.ssim, 1, '')}, {len(figures.frames)} frames"
     )
 
 

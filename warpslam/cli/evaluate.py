@@ -9,6 +9,7 @@ from warpslam.cli.common import add_command, add_device_option, print_reconstruc
 from warpslam.evaluation import DEFAULT_PROTOCOL, PROTOCOLS
 from warpslam.pipeline.finished import evaluate_run
 from warpslam.runs.folder import RunFolder
+from warpslam.runs.metrics import EvaluationMetrics
 from warpslam.storage.json_files import to_json
 
 
@@ -39,7 +40,7 @@ def _eval(options: argparse.Namespace) -> int:
     protocols = [options.protocol or DEFAULT_PROTOCOL]
     if options.protocol == "all":
         protocols = sorted(PROTOCOLS, key=lambda name: name != DEFAULT_PROTOCOL)
-    metrics = evaluate_run(
+    figures = evaluate_run(
         RunFolder.open(options.run),
         options.truth,
         max_difference=options.max_difference,
@@ -49,19 +50,20 @@ def _eval(options: argparse.Namespace) -> int:
         device=options.device,
     )
     if options.json:
-        print(to_json(metrics))
+        print(to_json(figures))
         return 0
-    rows = [("ATE aligned", 100, "cm", metrics["ate_m"]["aligned"])]
-    rows.append(("ATE unaligned", 100, "cm", metrics["ate_m"]["unaligned"]))
-    if "rpe" in metrics:
-        rows.append(("RPE translation", 100, "cm", metrics["rpe"]["translation_m"]))
-        rows.append(("RPE rotation", 1, "deg", metrics["rpe"]["rotation_deg"]))
-    for name, scale, unit, values in rows:
-        rest = "  ".join(f"{key} {scale * values[key]:.3f}" for key in ("mean", "median", "max"))
-        print(f"{name:16} RMSE {scale * values['rmse']:.3f} {unit}  {rest}")
-    print(f"{'frames':16} {metrics['frames']['compared']} of {metrics['frames']['estimated']} compared")
-    if "reconstruction" in metrics:
-        print_reconstruction(*metrics.get("reconstruction_by_protocol", {"": metrics["reconstruction"]}).values())
-    if "rendering" in metrics:
-        print_rendering(metrics["rendering"])
+    metrics = EvaluationMetrics()
+    metrics.fill(figures)
+    rows = [("ATE aligned", 100, "cm", metrics.ate_m.aligned), ("ATE unaligned", 100, "cm", metrics.ate_m.unaligned)]
+    if metrics.has("rpe"):
+        rows.append(("RPE translation", 100, "cm", metrics.rpe.translation_m))
+        rows.append(("RPE rotation", 1, "deg", metrics.rpe.rotation_deg))
+    for name, scale, unit, error in rows:
+        rest = "  ".join(f"{key} {scale * (getattr(error, key) or 0):.3f}" for key in ("mean", "median", "max"))
+        print(f"{name:16} RMSE {scale * (error.rmse or 0):.3f} {unit}  {rest}")
+    print(f"{'frames':16} {metrics.frames.compared} of {metrics.frames.estimated} compared")
+    if metrics.has("reconstruction"):
+        print_reconstruction(*(metrics.reconstruction_by_protocol.values() or [metrics.reconstruction]))
+    if metrics.has("rendering"):
+        print_rendering(metrics.rendering)
     return 0

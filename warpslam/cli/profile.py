@@ -64,7 +64,7 @@ def _profile(options: argparse.Namespace) -> int:
 def _input(options: argparse.Namespace) -> tuple[RgbdSequence, Config]:
     if options.folder == "demo":
         preset, overrides = options.preset or demo.PRESET, [*demo.OVERRIDES, *options.overrides]
-        return open_source(Source(None)), Config.from_preset(preset, overrides)
+        return open_source(Source.demo()), Config.from_preset(preset, overrides)
     source = Source(str(Path(options.folder).expanduser().resolve()), options.dataset, options.camera)
     sequence = open_source(source)
     return sequence, Config.from_preset(options.preset or sequence.preset, options.overrides)

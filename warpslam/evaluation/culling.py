@@ -36,15 +36,13 @@ _MOST_TRIANGLES = 500_000
 
 @dataclass(frozen=True)
 class Views:
-    """Depth images of one camera.
-
-    poses: Camera-to-world transforms, shape (F, 4, 4); a view with an unknown (NaN) pose sees nothing.
-    depths: Depth images (H, W) [m], F of them, 0 = missing.
-    """
+    """Depth images of one camera."""
 
     poses: np.ndarray
+    """Camera-to-world transforms, shape (F, 4, 4); a view with an unknown (NaN) pose sees nothing."""
     intrinsics: Intrinsics
     depths: Sequence[np.ndarray]
+    """Depth images (H, W) [m], F of them, 0 = missing."""
 
 
 class Culling:
@@ -128,8 +126,7 @@ def visible_points(
         x, y, z = ((points[rest] - t) @ R).T
         in_front = z > 1e-6
         rest, x, y, z = rest[in_front], x[in_front], y[in_front], z[in_front]
-        column = np.rint(intrinsics.fx * x / z + intrinsics.cx)
-        row = np.rint(intrinsics.fy * y / z + intrinsics.cy)
+        column, row = map(np.rint, intrinsics.project(x, y, z))
         inside = (column >= 0) & (column < intrinsics.width) & (row >= 0) & (row < intrinsics.height)
         if depth is not None:
             surface = depth[row[inside].astype(int), column[inside].astype(int)]

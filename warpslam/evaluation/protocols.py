@@ -12,6 +12,7 @@ import numpy as np
 from warpslam.evaluation.culling import DEFAULT_PROTOCOL, Culling, Views, check_protocol, sample_surface
 from warpslam.evaluation.reconstruction import ReconstructionResult, evaluate_reconstruction, load_mesh
 from warpslam.evaluation.virtual_views import virtual_culling_views, virtual_depth
+from warpslam.spread import spread
 
 if TYPE_CHECKING:
     import trimesh
@@ -51,7 +52,7 @@ def evaluate_mesh(
     """
     for protocol in protocols:
         check_protocol(protocol)
-    chosen = np.unique(np.linspace(0, len(frame_indices) - 1, FRAME_COUNT).round().astype(int))
+    chosen = spread(len(frame_indices), FRAME_COUNT)
     depths = [sequence[frame_indices[position]].depth for position in chosen]
     frames = Views(poses[chosen], sequence.intrinsics, depths)
     mesh = load_mesh(mesh_path)

@@ -35,15 +35,10 @@ RATIO_DISTANCE = 0.05  # [m]
 
 @dataclass(frozen=True)
 class ReconstructionResult:
-    """Distances [m] between a reconstruction and the true surface, and shares, 0..1.
-
-    protocol: What was compared, one of `warpslam.evaluation.PROTOCOLS`; None for all of both surfaces.
-    sample_count: Points drawn on the smaller of the two samples.
-    T_truth_mesh: Transform that was applied to the reconstruction, (4, 4); identity without alignment.
-    virtual_depth: Depth on virtual views; None where it was not asked for.
-    """
+    """Distances [m] between a reconstruction and the true surface, and shares, 0..1."""
 
     protocol: str | None
+    """What was compared, one of `warpslam.evaluation.PROTOCOLS`; None for all of both surfaces."""
     accuracy: float
     completion: float
     accuracy_ratio: float
@@ -51,8 +46,11 @@ class ReconstructionResult:
     f_score: float
     normal_consistency: float
     sample_count: int
+    """Points drawn on the smaller of the two samples."""
     T_truth_mesh: np.ndarray
+    """Transform that was applied to the reconstruction, (4, 4); identity without alignment."""
     virtual_depth: VirtualDepth | None = None
+    """Depth on virtual views; None where it was not asked for."""
 
 
 def evaluate_reconstruction(

@@ -23,35 +23,31 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Statistics:
-    """Errors of single frames or frame pairs and their summary, all in one unit.
-
-    errors: float64, shape (M,), in the order of the frames that were compared.
-    std: Population standard deviation.
-    skipped_count: Frames (or pairs) left out because a truth pose is unknown.
-    """
+    """Errors of single frames or frame pairs and their summary, all in one unit."""
 
     rmse: float
     mean: float
     median: float
     std: float
+    """Population standard deviation."""
     min: float
     max: float
     errors: np.ndarray
+    """float64, shape (M,), in the order of the frames that were compared."""
     skipped_count: int
+    """Frames (or pairs) left out because a truth pose is unknown."""
 
 
 @dataclass(frozen=True)
 class AteResult(Statistics):
-    """Absolute trajectory error [m].
-
-    frame_indices: Index of the frame that each of ``errors`` belongs to, int, shape (M,).
-    T_truth_estimate: Transform that was applied to the estimate, (4, 4); identity without alignment.
-    aligned: Whether the trajectories were aligned first.
-    """
+    """Absolute trajectory error [m]."""
 
     frame_indices: np.ndarray
+    """Index of the frame that each of ``errors`` belongs to, int, shape (M,)."""
     T_truth_estimate: np.ndarray
+    """Transform that was applied to the estimate, (4, 4); identity without alignment."""
     aligned: bool
+    """Whether the trajectories were aligned first."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +55,11 @@ class RpeResult:
     """Relative pose error over ``delta`` frames: translation [m] and rotation [deg]."""
 
     translation: Statistics
+    """[m]."""
     rotation: Statistics
+    """[degrees]."""
     delta: int
+    """Frames between the two poses of a pair."""
 
 
 def align_horn(source: np.ndarray, target: np.ndarray) -> np.ndarray:

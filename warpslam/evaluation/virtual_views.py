@@ -35,19 +35,18 @@ _TEST_STRIDE = 8  # a few pixels are enough to reject a view
 
 @dataclass(frozen=True)
 class VirtualDepth:
-    """Depth of a reconstruction against the true one, on virtual views.
-
-    l1: Mean |difference| [m] where the reconstruction has surface; None without a pixel to compare.
-    missed_share: Share, 0..1, of the pixels where it has none; None without a view.
-    l1_misses_as_zero: Mean |difference| [m] with depth 0 for a miss, as the released code counts; None without a view.
-    view_count, drawn_count: Views that were used, and drawn for that.
-    """
+    """Depth of a reconstruction against the true one, on virtual views."""
 
     l1: float | None
+    """Mean |difference| [m] where the reconstruction has surface; None without a pixel to compare."""
     missed_share: float | None
+    """Share, 0..1, of the pixels where it has none; None without a view."""
     l1_misses_as_zero: float | None
+    """Mean |difference| [m] with depth 0 for a miss, as the released code counts; None without a view."""
     view_count: int
+    """Views that were used."""
     drawn_count: int
+    """Views that were drawn to find those."""
 
 
 def virtual_poses(targets: np.ndarray, frames: Views, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -149,7 +148,7 @@ def _counted(depth: np.ndarray, camera: Intrinsics, T_world_camera: np.ndarray, 
     """Which pixels of a true depth image (H, W) show surface that counts, bool (H, W)."""
     v, u = np.nonzero(depth)
     z = depth[v, u].astype(np.float64)
-    local = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
+    local = camera.backproject(u, v, z)
     counted = np.zeros(depth.shape, dtype=bool)
     counted[v, u] = culling.keeps(local @ T_world_camera[:3, :3].T + T_world_camera[:3, 3])
     return counted

@@ -24,6 +24,7 @@ import numpy as np
 from warpslam.errors import CheckpointError, MissingDependencyError
 
 LEVELS = ("coarse", "middle", "fine", "color")
+"""Of the map; a stage of mapping is called after the last one that it optimises."""
 FEATURE_SIZE = 32
 EMBEDDING_SIZE = 93
 EMBEDDING_SCALE = 25.0

@@ -16,8 +16,6 @@ from warpslam.kernels.samples import Span
 from warpslam.runtime.launching import Step
 from warpslam.runtime.program import run_slices
 
-STAGES = ("coarse", "middle", "fine", "color")
-
 
 def query(batch: RayBatch, arrays: FieldArrays, stage: str) -> None:
     """Logit (and colour, in the colour stage) of every sample: `RayBatch.logit`, `RayBatch.color`."""

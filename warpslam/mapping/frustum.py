@@ -89,7 +89,6 @@ def measured_extent(
     """
     v, u = np.nonzero(depth[::stride, ::stride])
     d = depth[::stride, ::stride][v, u].astype(np.float64)
-    rays = np.stack([(u * stride - camera.cx) / camera.fx, (v * stride - camera.cy) / camera.fy, np.ones(len(u))], 1)
-    points = (rays * d[:, None]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    points = camera.backproject(u * stride, v * stride, d) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     points = np.concatenate([points, T_world_camera[None, :3, 3]])
     return points.min(axis=0), points.max(axis=0)

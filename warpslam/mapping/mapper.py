@@ -15,8 +15,9 @@ import warp as wp
 from warpslam.camera import Intrinsics
 from warpslam.config import MappingConfig, SamplingConfig
 from warpslam.field.arrays import Gradients, Thresholds
+from warpslam.field.decoders import LEVELS
 from warpslam.field.objectives import choose_inliers, mapping_loss
-from warpslam.field.passes import STAGES, render
+from warpslam.field.passes import render
 from warpslam.field.ray_batch import RayBatch
 from warpslam.field.seeds import ray_seed
 from warpslam.mapping.active_sampling import CellErrors
@@ -25,7 +26,6 @@ from warpslam.mapping.frustum import mark_seen, select_in_frustum
 from warpslam.mapping.window import overlapping_window, random_window
 from warpslam.poses import pose_from_vector, vector_from_pose
 from warpslam.runtime.launching import Launcher
-from warpslam.scene.feature_grid import LEVELS
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.optimizers import ColorDecoderOptimizer, GridOptimizer, PoseOptimizer
@@ -104,7 +104,7 @@ class Mapper:
         self._poses = PoseOptimizer(frame_count, self._launcher)
         samples = sampling.stratified + sampling.surface
         self._batch = RayBatch(config.pixels, samples, device, self._launcher)
-        self._losses = wp.zeros(len(STAGES), dtype=float, device=device)
+        self._losses = wp.zeros(len(LEVELS), dtype=float, device=device)
         self._errors: CellErrors | None = None
         if config.active_share > 0:
             self._errors = CellErrors(frame_count, config.active_share, sampling, device, self._launcher)
@@ -243,7 +243,7 @@ class Mapper:
                 _log.warning("frame %d: gradients of the %s were not finite and have been left out", call.frame, name)
         result = MappingResult(call.pose, window=[keyframe.index for keyframe in call.window], adjusted=call.adjust)
         losses = self._losses.numpy()
-        result.losses = {s: float(losses[STAGES.index(s)]) / max(count, 1) for s, count in call.ray_counts.items()}
+        result.losses = {s: float(losses[LEVELS.index(s)]) / max(count, 1) for s, count in call.ray_counts.items()}
         if call.adjust:
             # Adam moves the length of a quaternion freely, which changes nothing but the step sizes.
             poses = [pose_from_vector(vector) for vector in self._poses.vectors()]
@@ -358,7 +358,7 @@ class Mapper:
     def _note_loss(self, stage: str, call: _Call) -> None:
         """Keep the loss of the last iteration on the device until the end of the call."""
         call.ray_counts[stage] = self._batch.count
-        wp.copy(self._losses, self._batch.loss, dest_offset=STAGES.index(stage), count=1)
+        wp.copy(self._losses, self._batch.loss, dest_offset=LEVELS.index(stage), count=1)
 
 
 def _vectors(keyframes: list[Keyframe], pose: np.ndarray) -> np.ndarray:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from pathlib import Path
 
 import trimesh
 
 from warpslam.errors import MeshError
+from warpslam.storage.atomic import replacing
 
 MESH_SUFFIXES = (".ply", ".glb")
 
@@ -40,13 +40,10 @@ def write_mesh(mesh: trimesh.Trimesh, path: str | os.PathLike[str]) -> Path:
         data = trimesh.exchange.ply.export_ply(mesh, encoding="binary", vertex_normal=True)
     else:
         data = trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=True)
-    partial = path.with_name(path.name + ".partial")
     try:
-        partial.write_bytes(data)
-        os.replace(partial, path)
+        with replacing(path) as partial:
+            partial.write_bytes(data)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink()
         raise MeshError(
             f"{path}: can't be written ({error.strerror}); check that the folder exists and is writable"
         ) from error

@@ -6,10 +6,9 @@ written beside them in full before the names move, so one good checkpoint is the
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import logging
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,16 +16,19 @@ import numpy as np
 from warpslam.config import Config
 from warpslam.errors import CheckpointError, ConfigError, DatasetError
 from warpslam.runs.folder import RunFolder
-from warpslam.runs.record import RunProgress, result_row
-from warpslam.runs.request import RunRequest, Source
+from warpslam.runs.record import RunRecord
+from warpslam.runs.request import RunRequest, SequenceFacts, Source, differences
+from warpslam.runtime.cores import slice_count
 from warpslam.slam import Slam
 from warpslam.slam_state import state_arrays, state_from_arrays
-from warpslam.storage.state_file import StateFormat, read_state, sync_folder, write_state
+from warpslam.storage.atomic import sync_folder
+from warpslam.storage.state_file import StateFormat, read_state, write_state
 
 if TYPE_CHECKING:
+    from warpslam.pipeline.methods import Method
     from warpslam.sequences.base import Frame, RgbdSequence
 
-RUN_FORMAT = StateFormat("warpslam-run", 3)
+RUN_FORMAT = StateFormat("warpslam-run", 4)
 log = logging.getLogger(__name__)
 
 
@@ -35,30 +37,37 @@ class SavedRun:
     """A checkpoint that was read."""
 
     path: str
+    """File."""
+
     request: RunRequest
-    checkpoint_every: int
-    progress: RunProgress
+    """What the run was asked for, resolved."""
+
+    facts: SequenceFacts
+    """What its input was like."""
+
+    record: RunRecord
+    """What had become of it by then."""
+
     state: tuple[dict[str, Any], dict[str, np.ndarray]]
+    """The SLAM object, as `warpslam.slam_state.state_arrays` gives it."""
 
     @property
     def source(self) -> Source:
         """How to open the input again.
 
         Raises:
-            CheckpointError: the run was started from Python and did not say how.
+            CheckpointError: The run was started from Python and did not say how.
         """
         if self.request.source is None:
             raise CheckpointError(f"{self.path}: does not say how to open the input; resume it from Python")
-        return Source(**self.request.source)
+        return self.request.source
 
     def slam(self, config: Config | None = None) -> Slam:
         """The SLAM object as it was, with its settings or those given.
 
         Raises:
-            CheckpointError: a field is damaged.
+            CheckpointError: A field is damaged.
         """
-        from warpslam.runtime.cores import slice_count
-
         state = state_from_arrays(self.path, *self.state, config=config)
         slam = Slam.from_state(state, self.request.device)
         slam.config.mapping.enabled &= not self.request.localize_only
@@ -79,47 +88,84 @@ class SavedRun:
         """Refuse to go on with other settings or another input.
 
         Raises:
-            ConfigError: names what differs.
+            ConfigError: Names what differs.
         """
-        differences = self.request.differences(request)
-        for index, digest in self.progress.digests.items():
+        changes = self.request.differences(request) + differences(
+            asdict(self.facts), asdict(SequenceFacts.of(sequence))
+        )
+        for index, digest in self.record.digests.items():
             try:
-                if not differences and frame_digest(sequence[index]) != digest:
-                    differences.append(f"frame {index} of {sequence.name} has changed")
+                if not changes and frame_digest(sequence[index]) != digest:
+                    changes.append(f"frame {index} of {sequence.name} has changed")
             except DatasetError as error:
-                differences.append(f"frame {index} of {sequence.name} can't be read any more ({error})")
-        if differences:
+                changes.append(f"frame {index} of {sequence.name} can't be read any more ({error})")
+        if changes:
             raise ConfigError(
-                f"{self.path}: the run can't go on, because something else is asked for: {'; '.join(differences)}. "
+                f"{self.path}: the run can't go on, because something else is asked for: {'; '.join(changes)}. "
                 "Put that back, or start a new run"
             )
 
 
+@dataclass(eq=False)
+class Checkpoints:
+    """Writes the checkpoints of a run when they are due; none where the request asks for none."""
+
+    folder: RunFolder
+    """Where they are."""
+
+    request: RunRequest
+    """What the run was asked for, resolved."""
+
+    facts: SequenceFacts
+    """What its input is like."""
+
+    frame_count: int
+    """Frames of the selection."""
+
+    position: int | None = None
+    """Frames that were done at the last one; None without any."""
+
+    size: int | None = None
+    """Of the last one that was written [bytes]."""
+
+    def before_frames(self, record: RunRecord, slam: Method) -> None:
+        """A run that is stopped in its first frame can be resumed as well."""
+        if self.request.checkpoint_every is not None and self.position != record.position:
+            self._write(record, slam)
+
+    def after_frame(self, frame: Frame, record: RunRecord, slam: Method) -> None:
+        """Write one, if it is due after this frame."""
+        every = self.request.checkpoint_every
+        if every is None:
+            return
+        first = next(iter(record.digests), frame.index)
+        record.digests = {index: digest for index, digest in record.digests.items() if index == first}
+        is_due = record.position % every == 0 or record.position == self.frame_count
+        if is_due or not record.digests:
+            record.digests[frame.index] = frame_digest(frame)
+        if is_due and self.position != record.position:
+            self._write(record, slam)
+
+    def _write(self, record: RunRecord, slam: Method) -> None:
+        assert isinstance(slam, Slam), "no other method has checkpoints"
+        with record.clock("checkpoints"):
+            self.size = write_checkpoint(self.folder, self.request, self.facts, record, slam)
+        self.position = record.position
+
+
 def write_checkpoint(
-    folder: RunFolder, request: RunRequest, checkpoint_every: int, progress: RunProgress, slam: Slam
+    folder: RunFolder, request: RunRequest, facts: SequenceFacts, record: RunRecord, slam: Slam
 ) -> int:
     """Write a checkpoint; the last one before it stays. Returns its size [bytes].
 
     Raises:
-        CheckpointError: the file can't be written.
+        CheckpointError: The file can't be written.
     """
-    header, arrays = state_arrays(slam.state())
-    run = {
-        "request": dataclasses.asdict(request),
-        "checkpoint_every": checkpoint_every,
-        "position": progress.position,
-        "frame_indices": progress.frame_indices,
-        "left_out": progress.left_out,
-        "seconds": progress.seconds,
-        "first_index": progress.first_index,
-        "digests": list(progress.digests.items()),
-        "results": [result_row(result) for result in progress.results],
-    }
-    poses = [result.T_world_camera for result in progress.results]
-    arrays["run_truth_poses"] = np.array(progress.truth_poses, np.float64).reshape(-1, 4, 4)
-    arrays["run_poses"] = np.array(poses, np.float64).reshape(-1, 4, 4)
+    state, arrays = state_arrays(slam.state())
+    account, poses = record.to_state()
+    header = {"slam": state, "run": {"request": request.to_dict(), "input": asdict(facts), "record": account}}
     new = folder.checkpoint.with_name("checkpoint.next.safetensors")
-    size = write_state(new, RUN_FORMAT, {"slam": header, "run": run}, arrays)
+    size = write_state(new, RUN_FORMAT, header, {**arrays, **poses})
     if folder.checkpoint.exists():
         folder.checkpoint.replace(folder.previous_checkpoint)
     new.replace(folder.checkpoint)
@@ -131,7 +177,7 @@ def read_checkpoint(folder: RunFolder) -> SavedRun:
     """The last good checkpoint of a run.
 
     Raises:
-        CheckpointError: there is none; says what is wrong with each.
+        CheckpointError: There is none; says what is wrong with each.
     """
     found = [path for path in (folder.checkpoint, folder.previous_checkpoint) if path.exists()]
     if not found:
@@ -164,18 +210,12 @@ def find_checkpoint(folder: RunFolder, request: RunRequest, sequence: RgbdSequen
         return None, ""
     try:
         saved = read_checkpoint(folder)
-        if saved.request.device.startswith("cuda") and request.device.startswith("cuda"):
-            saved = dataclasses.replace(saved, request=dataclasses.replace(saved.request, device=request.device))
+        if all(str(one.device).startswith("cuda") for one in (saved.request, request)):
+            saved = replace(saved, request=replace(saved.request, device=request.device))
         saved.check(request, sequence)
     except (CheckpointError, ConfigError) as error:
         return None, str(error)
     return saved, ""
-
-
-def remove_checkpoints(folder: RunFolder) -> None:
-    """Once a run is over, its map holds all that they do."""
-    for path in (folder.checkpoint, folder.previous_checkpoint):
-        path.unlink(missing_ok=True)
 
 
 def frame_digest(frame: Frame) -> str:
@@ -187,25 +227,12 @@ def frame_digest(frame: Frame) -> str:
 
 
 def _saved_run(path: str, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> SavedRun:
-    from warpslam.frames import FrameResult
-
     try:
         run = header["run"]
-        request = RunRequest(**{**run["request"], "frames": tuple(run["request"]["frames"])})
-        Config.from_dict(request.config)
-        poses, truth = arrays.pop("run_poses"), arrays.pop("run_truth_poses")
-        progress = RunProgress(
-            position=int(run["position"]),
-            frame_indices=[int(index) for index in run["frame_indices"]],
-            truth_poses=list(truth.reshape(-1, 4, 4)),
-            results=[FrameResult(T_world_camera=pose, **row) for pose, row in zip(poses, run["results"], strict=True)],
-            left_out=[{"index": int(one["index"]), "message": str(one["message"])} for one in run["left_out"]],
-            seconds={str(name): float(seconds) for name, seconds in run["seconds"].items()},
-            first_index=int(run["first_index"]),
-            digests={int(index): str(digest) for index, digest in run["digests"]},
-        )
-        if not len(progress.results) == len(progress.frame_indices) == len(progress.truth_poses):
-            raise ValueError("its lists have different lengths")
-        return SavedRun(path, request, int(run["checkpoint_every"]), progress, (header["slam"], arrays))
+        request, facts = RunRequest.from_dict(run["request"]), SequenceFacts(**run["input"])
+        record = RunRecord.from_state(run["record"], arrays)
+        if request.config is None:
+            raise ValueError("its request has no settings")
+        return SavedRun(path, request, facts, record, (header["slam"], arrays))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: field run is damaged ({error!r}): use another copy") from None

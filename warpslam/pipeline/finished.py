@@ -18,31 +18,14 @@ from warpslam.evaluation import (
     trajectory_metrics,
 )
 from warpslam.pipeline.results import render_panel
-from warpslam.pipeline.setup import load_slam
+from warpslam.pipeline.setup import load_slam, open_source
 from warpslam.runs.folder import RunFolder
-from warpslam.runs.request import Source
+from warpslam.spread import spread
 from warpslam.storage.json_files import read_json
 from warpslam.storage.tum import associate, read_tum
 
 if TYPE_CHECKING:
     import trimesh
-
-    from warpslam.sequences.base import RgbdSequence
-
-
-def open_source(source: Source) -> RgbdSequence:
-    """Open the input of a run again.
-
-    Raises:
-        DatasetError: The folder is gone or can't be read any more.
-    """
-    if source.path is None:
-        from warpslam.synthetic.demo import demo_sequence
-
-        return demo_sequence()
-    from warpslam.sequences import open_sequence
-
-    return open_sequence(source.path, dataset=source.dataset, camera=source.camera)
 
 
 def evaluate_run(
@@ -105,7 +88,7 @@ def evaluate_run(
 def _rendering_metrics(folder: RunFolder, poses: np.ndarray, count: int, device: str | None) -> dict[str, Any]:
     slam, sequence = load_slam(folder, device), open_source(folder.read_source())
     indices = _frame_indices(folder, len(poses))
-    chosen = np.unique(np.linspace(0, len(poses) - 1, count).round().astype(int))
+    chosen = spread(len(poses), count)
     return rendering_metrics([render_panel(slam, sequence[indices[n]], poses[n]) for n in chosen])
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import numpy as np
 
 from warpslam.errors import ConfigError
+from warpslam.runs.request import DEFAULT_METHOD as DEFAULT_METHOD
 
 if TYPE_CHECKING:
     import trimesh
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from warpslam.frames import FrameResult
     from warpslam.trajectory import Trajectory
 
-DEFAULT_METHOD = "nice-slam"
 METHODS = (DEFAULT_METHOD, "imap", "tsdf")
 """What ``warpslam run --method`` takes."""
 

@@ -1,23 +1,70 @@
-"""What a run starts with: its frames, its device and kernels, its method, a map, and poses that are given to it."""
+"""What a run starts with: its sequence and frames, its settings, its device and kernels, and its method or a map."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import warp as wp
+
 from warpslam.errors import ConfigError, InputError
-from warpslam.pipeline.methods import DEFAULT_METHOD, build_method, check_method, has_checkpoints, load_method
+from warpslam.evaluation import load_mesh
+from warpslam.pipeline.methods import build_method, check_method, has_checkpoints, load_method
 from warpslam.runs.folder import RunFolder
-from warpslam.storage.json_files import read_json
+from warpslam.runs.metrics import RunMetrics
+from warpslam.runs.request import DEFAULT_METHOD, RunRequest, Source
+from warpslam.runtime.compilation import ModuleProgress, compile_kernels
+from warpslam.sequences import open_sequence
+from warpslam.slam import Slam
+from warpslam.slam_state import saved_config
+from warpslam.synthetic import demo
 
 if TYPE_CHECKING:
+    import trimesh
+
     from warpslam.camera import Intrinsics
     from warpslam.config import Config
     from warpslam.pipeline.methods import Method
-    from warpslam.runtime.compilation import ModuleProgress
     from warpslam.sequences.base import RgbdSequence
-    from warpslam.slam import Slam
+
+
+def open_source(source: Source) -> RgbdSequence:
+    """Open the input of a run.
+
+    Raises:
+        DatasetError: The folder is not there, or can't be read.
+    """
+    if source.is_demo:
+        return demo.demo_sequence()
+    return open_sequence(source.path or "", dataset=source.dataset, camera=source.camera)
+
+
+def true_surface(request: RunRequest, sequence: RgbdSequence) -> trimesh.Trimesh | None:
+    """The surface that a reconstruction is compared with: that of the request, or the built-in sequence's own.
+
+    Raises:
+        MeshError: The file can't be read.
+    """
+    if request.truth_mesh is not None:
+        return load_mesh(request.truth_mesh)
+    is_demo = request.source is not None and request.source.is_demo
+    return getattr(sequence, "mesh", None) if is_demo else None
+
+
+def resolve(request: RunRequest, sequence: RgbdSequence) -> RunRequest:
+    """The request with nothing left open: see `RunRequest.resolved`.
+
+    Raises:
+        ConfigError: Something asked for does not go together, or a setting is out of range.
+        CheckpointError: The settings of a map can't be read.
+    """
+    selected = select_frames(sequence, slice(*request.frames))
+    check_checkpoint_settings(request.checkpoint_every, request.map, request.localize_only, request.method)
+    if request.map is not None and request.config is None and request.preset is None:
+        request = replace(request, config=saved_config(Path(request.map)))
+    return request.resolved(sequence.preset, selected, device_name(request.device))
 
 
 def select_frames(sequence: RgbdSequence, frames: slice | None) -> range:
@@ -57,8 +104,6 @@ def check_device(device: str | None) -> None:
     Raises:
         ConfigError: It has not.
     """
-    import warp as wp
-
     names = [str(known) for known in wp.get_devices()]
     if device is not None and device not in (*names, "cuda"):
         raise ConfigError(f"device {device!r} is not there; this machine has {', '.join(names)}")
@@ -66,8 +111,6 @@ def check_device(device: str | None) -> None:
 
 def device_name(device: str | None) -> str:
     """The device that a name, or none, leads to; a name that leads nowhere is told of when the run starts."""
-    import warp as wp
-
     names = [str(known) for known in wp.get_devices()]
     return str(wp.get_device(device)) if device is None or device in (*names, "cuda") and names[1:] else str(device)
 
@@ -81,26 +124,18 @@ def load_kernels(
     Raises:
         ConfigError: There is no such device.
     """
-    import warp as wp
-
-    from warpslam.runtime.compilation import compile_kernels
-
     check_device(device)
     return compile_kernels(wp.get_device(device), report, getattr(sequence, "warp_modules", ()))
 
 
-def build_slam(intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Method:
-    """The SLAM object of a run.
+def build_slam(
+    intrinsics: Intrinsics, config: Config, device: str | None, seed: int, method: str = DEFAULT_METHOD
+) -> Method:
+    """The method of a run; see `warpslam.pipeline.methods.build_method` for what else it raises.
 
     Raises:
         ConfigError: There is no such device.
-        CheckpointError: The decoders can't be loaded.
     """
-    return build_baseline(DEFAULT_METHOD, intrinsics, config, device, seed)
-
-
-def build_baseline(method: str, intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Method:
-    """Any method of a run, by name; see `warpslam.pipeline.methods.build_method` for what it raises."""
     check_device(device)
     return build_method(method, intrinsics, config, device, seed)
 
@@ -115,8 +150,6 @@ def open_map(
         CheckpointError: The map can't be loaded.
         InputError: The map was made with another camera.
     """
-    from warpslam.slam import Slam
-
     check_device(device)
     slam = Slam.load(path, device, config=config, localize_only=localize_only)
     if slam.intrinsics != intrinsics:
@@ -135,4 +168,4 @@ def load_slam(folder: RunFolder, device: str | None = None) -> Method:
     """
     path = folder.require(folder.map, "the run stopped before it had a map")
     check_device(device)
-    return load_method(read_json(folder.metrics).get("method", DEFAULT_METHOD), path, device)
+    return load_method(RunMetrics.read(folder.metrics).method or DEFAULT_METHOD, path, device)

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 from warpslam.report.comparison import write_comparison as write_comparison
 from warpslam.report.data import RunData as RunData
+from warpslam.report.page import write_page
+from warpslam.report.sections import run_page
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,7 +26,4 @@ def write_report(folder: RunFolder, output: str | Path | None = None) -> Path:
         DatasetError: A file of the run is damaged.
         ConfigError: The report can't be written there.
     """
-    from warpslam.report.page import write_page
-    from warpslam.report.sections import run_page
-
     return write_page(run_page(RunData.gather(folder)), output if output is not None else folder.report)

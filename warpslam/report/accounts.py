@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from warpslam.frames import FrameStatus
 from warpslam.report import charts
 from warpslam.report.data import RunData
 from warpslam.report.page import Html, element, figures, join, legend, missing, section, table
 from warpslam.report.text import cubic_metres, duration, megabytes, percent
+from warpslam.runs.record import UNREADABLE
 
 MAX_LISTED = 100
 
@@ -72,26 +72,28 @@ def stage_seconds(run: RunData) -> list[tuple[str, float]]:
 def memory_section(run: RunData) -> Html:
     """What the map takes, and what it has seen."""
     title = "Map and memory"
-    levels = run.figure("levels")
-    facts: list[tuple[str, str | None, str]] = []
-    bytes_ = run.figure("map", "bytes") or (sum(level["bytes"] for level in levels.values()) if levels else None)
-    facts.append(("Map", megabytes(bytes_), "features of all levels"))
-    facts.append(("Observed", cubic_metres(run.figure("observed_volume_m3")), "crossed by depth rays of mapped frames"))
-    bounds = run.figure("bounds_m")
-    extent = " × ".join(f"{high - low:.1f}" for low, high in zip(*bounds, strict=True)) if bounds else None
-    facts.append(("Extent", f"{extent} m" if extent else None, "box of the grids"))
-    peak = run.figure("peak_memory_mib")
-    facts.append(("Peak memory", megabytes(peak * 2**20) if peak else None, "of the process"))
+    metrics, levels = run.metrics, run.metrics.levels
+    bytes_ = metrics.map.bytes or sum(level.bytes for level in levels.values()) or None
+    bounds, peak = metrics.bounds_m, metrics.peak_memory_mib
+    extent = (
+        " × ".join(f"{(high or 0) - (low or 0):.1f}" for low, high in zip(*bounds, strict=True)) if bounds else None
+    )
+    facts: list[tuple[str, str | None, str]] = [
+        ("Map", megabytes(bytes_), "features of all levels"),
+        ("Observed", cubic_metres(metrics.observed_volume_m3), "crossed by depth rays of mapped frames"),
+        ("Extent", f"{extent} m" if extent else None, "box of the grids"),
+        ("Peak memory", megabytes(peak * 2**20) if peak else None, "of the process"),
+    ]
     content = [figures(facts)]
     if levels:
-        largest = max(level["bytes"] for level in levels.values())
+        largest = max(level.bytes for level in levels.values())
         rows = [
             [
                 name,
-                f"{level['spacing_m']:g} m",
-                " × ".join(str(n) for n in level["shape"]),
-                megabytes(level["bytes"]) or "",
-                charts.value_bar(level["bytes"], largest, "c0"),
+                f"{level.spacing_m:g} m",
+                " × ".join(str(n) for n in level.shape),
+                megabytes(level.bytes) or "",
+                charts.value_bar(level.bytes, largest, "c0"),
             ]
             for name, level in levels.items()
         ]
@@ -104,23 +106,25 @@ def memory_section(run: RunData) -> Html:
 def frames_section(run: RunData) -> Html:
     """What became of the frames, and why some are not OK."""
     title = "Frames"
-    counts = run.figure("frames") or {}
-    names = [(name, counts[name]) for name in ("OK", "LOST", "SKIPPED", "unreadable") if counts.get(name)]
+    names = run.metrics.frames.by_status
     if not names:
         return section("frames", title, missing("No frame was processed."))
     content: list[Html] = [
         charts.share_bar("Frames by status", [(name, f"{count} {name}", count) for name, count in names]),
         legend(*((name, f"{count} {name}") for name, count in names)),
     ]
-    rows = [[str(frame.index), frame.status, frame.message or "–"] for frame in run.frames if frame.status != "OK"]
-    rows += [[str(frame.get("index")), "unreadable", str(frame.get("message"))] for frame in run.left_out]
-    rows.sort(key=lambda row: int(row[0]) if row[0].isdigit() else 0)
+    record = run.record
+    bad = [
+        (n, str(result.status), result.message or "–") for n, result in record.frames if result.status != FrameStatus.OK
+    ]
+    bad += [(frame.index, UNREADABLE, frame.message) for frame in record.left_out]
+    rows = [[str(index), status, message] for index, status, message in sorted(bad)]
     if rows:
         content.append(table(("frame", "status", "why"), rows[:MAX_LISTED], "reasons"))
         if len(rows) > MAX_LISTED:
             rest = f"{len(rows) - MAX_LISTED} more are in {run.folder.frame_records.name}."
             content.append(element("p", rest, class_="missing"))
-    elif not run.frames:
+    elif not record.frames:
         content.append(missing("The run did not record why frames were lost or skipped."))
     else:
         content.append(element("p", "Every frame was tracked."))
@@ -137,7 +141,9 @@ def settings_section(run: RunData) -> Html:
         repeat = missing("The run was started by a program, so there is no command to repeat it; see the settings.")
     place = None
     if run.source is not None:
-        place = element("p", "Input: ", element("code", run.source.path or "built-in demo sequence"))
+        place = element(
+            "p", "Input: ", element("code", "built-in demo sequence" if run.source.is_demo else str(run.source.path))
+        )
     if run.config is None:
         return section("settings", title, repeat, place, missing("The run did not write its settings."))
     fold = element("details", element("summary", "Effective settings"), element("pre", element("code", run.config)))
@@ -147,13 +153,12 @@ def settings_section(run: RunData) -> Html:
 def versions_section(run: RunData) -> Html:
     """Software and machine."""
     title = "Versions"
-    versions: dict[str, Any] = run.figure("versions") or {}
-    rows = [[name, version or "not installed"] for name, version in versions.items()]
-    if not rows and run.figure("warpslam"):
-        rows.append(["warpslam", str(run.figure("warpslam"))])
-    for name, label in (("platform", "platform"), ("processors", "processors"), ("device", "Warp device")):
-        if run.figure(name) is not None:
-            rows.append([label, str(run.figure(name))])
+    metrics = run.metrics
+    rows = [[name, version or "not installed"] for name, version in metrics.versions.items()]
+    if not rows and metrics.warpslam:
+        rows.append(["warpslam", metrics.warpslam])
+    machine = (("platform", metrics.platform), ("processors", metrics.processors), ("Warp device", metrics.device))
+    rows += [[label, str(value)] for label, value in machine if value is not None]
     if not rows:
         return section("versions", title, missing("The run did not record versions."))
     return section("versions", title, table(("", ""), rows, "versions"))

@@ -5,37 +5,45 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 from warpslam.report import charts
 from warpslam.report.data import RunData
 from warpslam.report.page import Html, element, figures, join, missing, page, section, table, void, write_page
+from warpslam.report.sections import views_of
 from warpslam.report.text import centimetres, decibels, duration, megabytes, percent
 from warpslam.runs.folder import RunFolder
+from warpslam.runs.metrics import RunMetrics
+from warpslam.runs.record import FINISHED
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of each run.
-
-    title: Its name. path: Where metrics.json has it. text: How it is written. lower_is_better: Which value is best.
-    """
+    """A figure of each run."""
 
     title: str
-    path: tuple[str, ...]
+    """Its name."""
+
+    value: Callable[[RunMetrics], float | None]
+    """Where metrics.json has it."""
+
     text: Callable[[float], str | None]
+    """How it is written."""
+
     lower_is_better: bool = True
+    """Which value is best."""
 
 
 FIGURES = (
-    Figure("ATE RMSE", ("ate_m", "aligned", "rmse"), centimetres),
-    Figure("Mesh accuracy", ("reconstruction", "accuracy_m"), centimetres),
-    Figure("Mesh completion", ("reconstruction", "completion_m"), centimetres),
-    Figure("Within 5 cm", ("reconstruction", "completion_ratio_5cm"), percent, lower_is_better=False),
-    Figure("Depth L1", ("rendering", "depth_l1_m"), centimetres),
-    Figure("PSNR", ("rendering", "psnr_db"), decibels, lower_is_better=False),
-    Figure("Speed", ("fps",), lambda fps: f"{fps:.2f} fps", lower_is_better=False),
-    Figure("Time", ("seconds", "run"), duration),
-    Figure("Peak memory", ("peak_memory_mib",), lambda mib: megabytes(mib * 2**20)),
+    Figure("ATE RMSE", lambda run: run.ate_m.aligned.rmse, centimetres),
+    Figure("Mesh accuracy", lambda run: run.reconstruction.accuracy_m, centimetres),
+    Figure("Mesh completion", lambda run: run.reconstruction.completion_m, centimetres),
+    Figure("Within 5 cm", lambda run: run.reconstruction.completion_ratio_5cm, percent, lower_is_better=False),
+    Figure("Depth L1", lambda run: run.rendering.depth_l1_m, centimetres),
+    Figure("PSNR", lambda run: run.rendering.psnr_db, decibels, lower_is_better=False),
+    Figure("Speed", lambda run: run.fps, lambda fps: f"{fps:.2f} fps", lower_is_better=False),
+    Figure("Time", lambda run: run.seconds.run, duration),
+    Figure("Peak memory", lambda run: run.peak_memory_mib, lambda mib: megabytes(mib * 2**20)),
 )
 
 
@@ -82,22 +90,22 @@ def run_names(runs: Sequence[RunData]) -> list[str]:
 
 def table_section(runs: Sequence[RunData], names: Sequence[str], base: Path) -> Html:
     """All figures; the best of each in bold."""
-    shown = [figure for figure in FIGURES if any(run.figure(*figure.path) is not None for run in runs)]
+    shown = [figure for figure in FIGURES if any(figure.value(run.metrics) is not None for run in runs)]
     best = {figure: _best(figure, runs) for figure in shown}
     facts: list[tuple[str, Callable[[RunData], str]]] = [
-        ("status", lambda run: str(run.figure("status") or "unknown")),
+        ("status", lambda run: run.metrics.status or "unknown"),
         ("tracked", _frames),
     ]
     if len({run.name for run in runs}) > 1:
         facts.insert(0, ("sequence", lambda run: run.name))
-    if any(run.figure("method") for run in runs):
-        facts.insert(0, ("method", lambda run: str(run.figure("method") or "–")))
+    if any(run.metrics.method for run in runs):
+        facts.insert(0, ("method", lambda run: run.metrics.method or "–"))
     rows = []
     for run, name in zip(runs, names, strict=True):
         cells: list[str] = [_link(run, name, base)]
         cells += [text(run) for _, text in facts]
         for figure in shown:
-            value = run.figure(*figure.path)
+            value = figure.value(run.metrics)
             text = "–" if value is None else figure.text(value) or "–"
             cells.append(element("strong", text) if value is not None and value == best[figure] else text)
         rows.append(cells)
@@ -111,7 +119,7 @@ def bars_section(runs: Sequence[RunData], names: Sequence[str]) -> Html:
     """Each figure as bars, one a run."""
     blocks = []
     for figure in FIGURES:
-        values = [run.figure(*figure.path) for run in runs]
+        values = [figure.value(run.metrics) for run in runs]
         known = [value for value in values if value is not None]
         if not known:
             continue
@@ -133,8 +141,6 @@ def bars_section(runs: Sequence[RunData], names: Sequence[str]) -> Html:
 
 def meshes_section(runs: Sequence[RunData], names: Sequence[str]) -> Html:
     """A picture of each mesh, all from above."""
-    from warpslam.report.sections import views_of
-
     pictures = []
     for run, name in zip(runs, names, strict=True):
         views = views_of(run, limit=2)[-1:]
@@ -151,10 +157,11 @@ def runs_section(runs: Sequence[RunData], names: Sequence[str]) -> Html:
     blocks = []
     for run, name in zip(runs, names, strict=True):
         command = run.source.command if run.source is not None else None
-        error = run.figure("error")
+        metrics = run.metrics
+        error = metrics.error
         facts = [
-            ("Device", str(run.figure("device") or "") or None, f"warpslam {run.figure('warpslam')}"),
-            ("Seed", None if run.figure("seed") is None else str(run.figure("seed")), ""),
+            ("Device", metrics.device, f"warpslam {metrics.warpslam}"),
+            ("Seed", None if metrics.seed is None else str(metrics.seed), ""),
         ]
         blocks.append(
             element(
@@ -172,22 +179,20 @@ def runs_section(runs: Sequence[RunData], names: Sequence[str]) -> Html:
 
 def _best(figure: Figure, runs: Sequence[RunData]) -> float | None:
     # What a run that broke off saved in time or memory is no merit.
-    finished = [run for run in runs if run.figure("status") == "finished"]
-    values = [value for run in finished if (value := run.figure(*figure.path)) is not None]
+    finished = [run for run in runs if run.metrics.status == FINISHED]
+    values = [value for run in finished if (value := figure.value(run.metrics)) is not None]
     if len(values) < 2:
         return None
     return min(values) if figure.lower_is_better else max(values)
 
 
 def _frames(run: RunData) -> str:
-    counts = run.figure("frames") or {}
-    return f"{counts['OK']} of {counts['selected']}" if {"OK", "selected"} <= counts.keys() else "–"
+    counts = run.metrics.frames
+    return "–" if counts.OK is None or counts.selected is None else f"{counts.OK} of {counts.selected}"
 
 
 def _link(run: RunData, name: str, base: Path) -> Html | str:
     """The name, leading to the run's report by a relative path where there is one below the page's folder."""
-    from urllib.parse import quote
-
     try:
         relative = run.folder.report.resolve().relative_to(base.resolve())
     except ValueError:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import html
 from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
 
 from warpslam.errors import ConfigError
+from warpslam.storage.atomic import replacing
 
 
 class Html(str):
@@ -128,13 +128,10 @@ def write_page(content: Html, path: str | Path) -> Path:
         ConfigError: The file can't be written.
     """
     path = Path(path)
-    partial = path.with_name(path.name + ".partial")
     try:
-        partial.write_text(content, encoding="utf-8")
-        partial.replace(path)
+        with replacing(path) as partial:
+            partial.write_text(content, encoding="utf-8")
     except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
         raise ConfigError(f"report {path} can't be written ({error.strerror}); choose another file with -o") from error
     return path
 

@@ -25,14 +25,16 @@ MIN_KEPT = 0.2  # of the faces; where the cut leaves fewer, it was no ceiling
 
 @dataclass(frozen=True)
 class MeshView:
-    """A picture of the mesh.
-
-    title: What it shows. uri: The picture. path: Where the cameras appear in it [px], shape (N, 2), or None.
-    """
+    """A picture of the mesh."""
 
     title: str
+    """What it shows."""
+
     uri: str
+    """The picture."""
+
     path: np.ndarray | None = None
+    """Where the cameras appear in it [px], shape (N, 2), or None."""
 
 
 def data_uri(image: np.ndarray) -> str:
@@ -154,8 +156,8 @@ def _look(center: np.ndarray, back: np.ndarray, up: np.ndarray, camera: Intrinsi
 
 
 def _project(points: np.ndarray, T_world_camera: np.ndarray, camera: Intrinsics) -> np.ndarray:
-    x, y, z = ((points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]).T
-    return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1)
+    local = (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+    return np.stack(camera.project(*local.T), axis=1)
 
 
 def _render(mesh: trimesh.Trimesh, camera: Intrinsics, T_world_camera: np.ndarray, max_depth: float) -> np.ndarray:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from warpslam.frames import FrameStatus
 from warpslam.runs.panels import Panel
 
 if TYPE_CHECKING:
@@ -18,7 +20,7 @@ _TRUTH_COLOR, _ESTIMATE_COLOR, _TROUBLE_COLOR = "0.55", "tab:blue", "tab:red"
 _DEPTH_DIFFERENCE = 0.1  # [m], ends of the colour scale
 
 
-def plot_top_view(path: str | Path, poses: np.ndarray, truth: np.ndarray | None, status: list[str]) -> None:
+def plot_top_view(path: str | Path, poses: np.ndarray, truth: np.ndarray | None, status: Sequence[str]) -> None:
     """Draw the camera path from above, over the ground truth where there is one.
 
     Args:
@@ -35,7 +37,7 @@ def plot_top_view(path: str | Path, poses: np.ndarray, truth: np.ndarray | None,
     position = poses[:, :3, 3]
     axes.plot(position[:, across], position[:, along], color=_ESTIMATE_COLOR, linewidth=1.2, label="estimate")
     axes.plot(*position[0, [across, along]], "o", color=_ESTIMATE_COLOR, label="start")
-    trouble = np.array([s != "OK" for s in status])
+    trouble = np.array([s != FrameStatus.OK for s in status])
     if trouble.any():
         axes.plot(*position[trouble][:, [across, along]].T, "x", color=_TROUBLE_COLOR, label="lost or skipped")
     axes.set(xlabel=f"{'xyz'[across]} [m]", ylabel=f"{'xyz'[along]} [m]", title="Camera path from above")
@@ -58,7 +60,7 @@ def plot_error(
     timestamps: np.ndarray,
     error: AteResult | None,
     losses: dict[str, np.ndarray],
-    status: list[str],
+    status: Sequence[str],
 ) -> None:
     """Draw the position error over time, or the tracking losses where there is no ground truth.
 
@@ -84,7 +86,7 @@ def plot_error(
         axes.set(ylabel="loss", title="Tracking losses (no ground truth)")
         if losses:
             axes.set_yscale("log")
-    for number, time in enumerate(elapsed[[s != "OK" for s in status]]):
+    for number, time in enumerate(elapsed[[s != FrameStatus.OK for s in status]]):
         axes.axvline(time, color=_TROUBLE_COLOR, alpha=0.3, label="lost or skipped" if number == 0 else None)
     axes.set_xlabel("time [s]")
     axes.grid(alpha=0.3)
@@ -108,7 +110,7 @@ def plot_panels(path: str | Path, panels: list[Panel]) -> None:
     figure_width = 6 * image_width + 7 * gap + label
     figure_height = len(panels) * (image_height + gap) + 2 * label
     # Places are known beforehand; a layout engine takes seconds to find them for this many axes.
-    figure = _figure(figure_width, figure_height, layout="none")
+    figure = _figure(figure_width, figure_height, layout=None)
     grid = figure.subplots(
         len(panels),
         6,
@@ -145,7 +147,7 @@ def plot_panels(path: str | Path, panels: list[Panel]) -> None:
     _save(figure, path)
 
 
-def _figure(width: float, height: float, layout: Literal["constrained", "none"] = "constrained") -> Figure:
+def _figure(width: float, height: float, layout: Literal["constrained"] | None = "constrained") -> Figure:
     # Figure, not pyplot: no window system, no global state that would outlive the call.
     from matplotlib.figure import Figure
 

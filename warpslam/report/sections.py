@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
 import numpy as np
 
 from warpslam.errors import MeshError
-from warpslam.evaluation import depth_l1
+from warpslam.evaluation import depth_l1, load_mesh, psnr
+from warpslam.frames import FrameStatus
 from warpslam.report import charts
-from warpslam.report.accounts import frames_section, memory_section, settings_section, timing_section, versions_section
+from warpslam.report.accounts import (
+    frames_section,
+    memory_section,
+    settings_section,
+    timing_section,
+    versions_section,
+)
 from warpslam.report.data import RunData, axis_name, upright_axes
 from warpslam.report.page import Html, element, figures, join, legend, missing, page, section, table, void
-from warpslam.report.pictures import MeshView, color_map, color_stops, data_uri, mesh_views
+from warpslam.report.pictures import VIEW_HEIGHT, VIEW_WIDTH, MeshView, color_map, color_stops, data_uri, mesh_views
 from warpslam.report.text import centimetres, decibels, duration, number, percent
 
 NO_TRUTH = "The sequence has no ground truth, so there is no error to measure."
@@ -43,16 +51,16 @@ def run_page(run: RunData) -> Html:
 
 def run_header(run: RunData) -> Html:
     """Name, state and circumstances of a run."""
-    status = str(run.figure("status") or "unknown")
-    frames = run.figure("frames", "processed")
+    metrics = run.metrics
+    status, frames = metrics.status or "unknown", metrics.frames
     facts = [
-        f"{frames} of {run.figure('frames', 'selected')} frames" if frames is not None else None,
-        str(run.figure("method")) if run.figure("method") else None,
-        f"on {run.figure('device')}" if run.figure("device") else None,
-        f"seed {run.figure('seed')}" if run.figure("seed") is not None else None,
-        f"started {run.figure('started')}".replace("T", " ") if run.figure("started") else None,
+        f"{frames.processed} of {frames.selected} frames" if frames.processed is not None else None,
+        metrics.method,
+        f"on {metrics.device}" if metrics.device else None,
+        f"seed {metrics.seed}" if metrics.seed is not None else None,
+        f"started {metrics.started}".replace("T", " ") if metrics.started else None,
     ]
-    error = run.figure("error")
+    error = metrics.error
     return join(
         element("p", "warpslam run", class_="kicker"),
         element("h1", run.name, " ", element("span", status, class_=f"status {status}")),
@@ -63,23 +71,20 @@ def run_header(run: RunData) -> Html:
 
 def figures_section(run: RunData) -> Html:
     """Headline figures."""
-    counts = run.figure("frames") or {}
-    ate = run.figure("ate_m", "aligned", "rmse")
-    mesh_error = run.figure("reconstruction", "error") or run.figure("mesh", "error")
-    no_surface = mesh_error or "no true surface to compare with"
-    fps = run.figure("fps")
-    compile_seconds = run.figure("seconds", "kernel_compile")
-    share = run.figure("reconstruction", "completion_ratio_5cm")
-    parts = [f"{counts[name]} {name}" for name in ("OK", "LOST", "SKIPPED", "unreadable") if counts.get(name)]
+    metrics, surface, rendering = run.metrics, run.metrics.reconstruction, run.metrics.rendering
+    ate, fps, share = metrics.ate_m.aligned.rmse, metrics.fps, surface.completion_ratio_5cm
+    no_surface = surface.error or metrics.mesh.error or "no true surface to compare with"
+    frames, compiling = metrics.frames.processed, duration(metrics.seconds.kernel_compile) or "no time"
+    parts = [f"{count} {name}" for name, count in metrics.frames.by_status]
     rows = [
         ("ATE RMSE", centimetres(ate), "after alignment" if ate is not None else "no ground truth"),
-        ("Mesh accuracy", centimetres(run.figure("reconstruction", "accuracy_m")), "" if share else no_surface),
-        ("Mesh completion", centimetres(run.figure("reconstruction", "completion_m")), _within(share, no_surface)),
-        ("Depth error", centimetres(run.figure("rendering", "depth_l1_m")), "L1 of rendered images, not the mesh"),
-        ("Colour", decibels(run.figure("rendering", "psnr_db")), "PSNR of rendered images"),
-        ("Frames", str(counts["processed"]) if "processed" in counts else None, ", ".join(parts)),
-        ("Speed", f"{fps:.2f} fps" if fps else None, f"device {run.figure('device')}"),
-        ("Time", duration(run.figure("seconds", "run")), f"and {duration(compile_seconds) or 'no time'} compiling"),
+        ("Mesh accuracy", centimetres(surface.accuracy_m), "" if share else no_surface),
+        ("Mesh completion", centimetres(surface.completion_m), _within(share, no_surface)),
+        ("Depth error", centimetres(rendering.depth_l1_m), "L1 of rendered images, not the mesh"),
+        ("Colour", decibels(rendering.psnr_db), "PSNR of rendered images"),
+        ("Frames", None if frames is None else str(frames), ", ".join(parts)),
+        ("Speed", f"{fps:.2f} fps" if fps else None, f"device {metrics.device}"),
+        ("Time", duration(metrics.seconds.run), f"and {compiling} compiling"),
     ]
     return section("figures", "Figures", figures(rows))
 
@@ -100,7 +105,7 @@ def trajectory_section(run: RunData) -> tuple[Html, np.ndarray | None]:
         lines.insert(0, ("truth", "ground truth", run.truth[:, :3, 3] @ axes[:2].T))
     points = [("start", f"start, frame {run.frame_indices[0]}", ground[0])]
     for position, status in enumerate(run.statuses):
-        if status != "OK":
+        if status != FrameStatus.OK:
             points.append((status, f"frame {run.frame_indices[position]}: {status}", ground[position]))
     chart, pixels = charts.ground_chart(
         "Camera path from above", lines, axis_names=(axis_name(axes[0]), axis_name(axes[1])), points=points, cursor=True
@@ -108,7 +113,7 @@ def trajectory_section(run: RunData) -> tuple[Html, np.ndarray | None]:
     entries = [("estimate", "estimate"), ("start", "start")]
     if run.truth is not None:
         entries.insert(0, ("truth", "ground truth"))
-    entries += [(status, status) for status in sorted({*run.statuses} - {"OK"})]
+    entries += [(status, status) for status in sorted({*run.statuses} - {FrameStatus.OK})]
     length = float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
     seconds = run.timestamps[-1] - run.timestamps[0]
     caption = f"Seen from above; the path is {length:.2f} m long and takes {duration(float(seconds))}."
@@ -119,16 +124,17 @@ def trajectory_section(run: RunData) -> tuple[Html, np.ndarray | None]:
 
 
 def _error_table(run: RunData) -> Html:
+    ate, rpe = run.metrics.ate_m, run.metrics.rpe
     rows = []
-    for title, path, scale, unit in (
-        ("ATE aligned", ("ate_m", "aligned"), 100, " cm"),
-        ("ATE unaligned", ("ate_m", "unaligned"), 100, " cm"),
-        ("RPE translation", ("rpe", "translation_m"), 100, " cm"),
-        ("RPE rotation", ("rpe", "rotation_deg"), 1, "°"),
+    for title, error, scale, unit in (
+        ("ATE aligned", ate.aligned, 100, " cm"),
+        ("ATE unaligned", ate.unaligned, 100, " cm"),
+        ("RPE translation", rpe.translation_m, 100, " cm"),
+        ("RPE rotation", rpe.rotation_deg, 1, "°"),
     ):
-        values = run.figure(*path)
-        if values:
-            rows.append([title, *(f"{scale * values[key]:.3f}{unit}" for key in ("rmse", "mean", "median", "max"))])
+        values = (error.rmse, error.mean, error.median, error.max)
+        if error.rmse is not None:
+            rows.append([title, *("–" if value is None else f"{scale * value:.3f}{unit}" for value in values)])
     return table(("", "RMSE", "mean", "median", "largest"), rows, "numbers") if rows else missing(NO_TRUTH)
 
 
@@ -140,7 +146,7 @@ def error_section(run: RunData) -> Html:
     marks = [
         (position, status, f"frame {run.frame_indices[position]}: {status}")
         for position, status in enumerate(run.statuses)
-        if status != "OK"
+        if status != FrameStatus.OK
     ]
     content = []
     if run.ate is None:
@@ -157,19 +163,17 @@ def error_section(run: RunData) -> Html:
         unknown = f"; {skipped} frames have no truth" if skipped else ""
         caption = f"Distance from the true position, after alignment{unknown}."
         content.append(element("figure", chart, element("figcaption", caption)))
-    if run.frames:
+    if run.record.frames:
         content.append(_tracking_charts(run, x, marks))
     else:
         content.append(missing("The run did not record losses and inliers of its frames."))
     return section("error", "Error over time", content)
 
 
-def _tracking_charts(run: RunData, x: np.ndarray, marks: list[tuple[int, str, str]]) -> Html:
-    names = sorted({name for frame in run.frames for name in frame.losses}, key=lambda name: (name != "tracking", name))
-    losses = [
-        (f"c{n % 6}", name, np.array([np.nan if (v := f.losses.get(name)) is None else v for f in run.frames]))
-        for n, name in enumerate(names)
-    ]
+def _tracking_charts(run: RunData, x: np.ndarray, marks: Sequence[tuple[int, str, str]]) -> Html:
+    values = run.record.losses
+    names = sorted(values, key=lambda name: (name != "tracking", name))
+    losses = [(f"c{n % 6}", name, values[name]) for n, name in enumerate(names)]
     content = []
     if losses:
         chart = charts.time_chart(
@@ -184,7 +188,7 @@ def _tracking_charts(run: RunData, x: np.ndarray, marks: list[tuple[int, str, st
         )
         entries = legend(*((key, name) for key, name, _ in losses))
         content.append(element("figure", chart, entries, element("figcaption", "Mean loss per ray, by stage.")))
-    inliers = np.array([np.nan if frame.inliers is None else 100 * frame.inliers for frame in run.frames])
+    inliers = np.array([100 * result.inliers for result in run.record.results])
     chart = charts.time_chart(
         "Inliers over time", x, [("estimate", "inliers", inliers)],
         x_label="time [s]", y_label="inliers [%]", marks=marks, top=105.0,
@@ -198,8 +202,6 @@ def images_section(run: RunData) -> Html:
     """Input, rendering and difference of some frames."""
     if not run.panels:
         return section("images", "Input and rendering", missing("The run rendered no images of its map."))
-    from warpslam.evaluation import psnr
-
     measured = np.concatenate([panel.depth[panel.depth > 0] for panel in run.panels])
     near, far = np.percentile(measured, [1, 99]) if len(measured) else (0.0, 1.0)
     blocks = []
@@ -248,32 +250,31 @@ def mesh_section(run: RunData) -> Html:
     """The mesh from several sides, with the path of the camera."""
     title = "Mesh"
     if not run.folder.mesh.is_file():
-        reason = run.figure("mesh", "error") or run.figure("error")
-        return section("mesh", title, missing(f"There is no mesh{': ' + str(reason) if reason else '.'}"))
-    size = run.figure("mesh") or {}
-    facts = [f"{size[name]:,} {name}".replace(",", " ") for name in ("vertices", "faces") if name in size]
-    if "area_m2" in size:
-        facts.append(f"{size['area_m2']:.1f} m² of surface")
+        reason = run.metrics.mesh.error or run.metrics.error
+        return section("mesh", title, missing(f"There is no mesh{': ' + reason if reason else '.'}"))
+    size, surface = run.metrics.mesh, run.metrics.reconstruction
+    counts = (("vertices", size.vertices), ("faces", size.faces))
+    facts = [f"{count:,} {name}".replace(",", " ") for name, count in counts if count is not None]
+    if size.area_m2 is not None:
+        facts.append(f"{size.area_m2:.1f} m² of surface")
     views = element("div", [_mesh_figure(view, n == 0) for n, view in enumerate(views_of(run))], class_="views")
-    reconstruction = run.figure("reconstruction")
     rows: list[list[str]] = []
-    if reconstruction and "error" not in reconstruction:
-        rows = [
-            ["Accuracy", centimetres(reconstruction["accuracy_m"]) or "–", "from the mesh to the true surface"],
-            ["Completion", centimetres(reconstruction["completion_m"]) or "–", "from the true surface to the mesh"],
-            ["Completion ratio", percent(reconstruction["completion_ratio_5cm"]), "of the true surface within 5 cm"],
-        ]
-    elif reconstruction:
-        facts.append(f"not compared with the true surface: {reconstruction['error']}")
-    else:
+    if surface.error is not None:
+        facts.append(f"not compared with the true surface: {surface.error}")
+    elif surface.accuracy_m is None:
         facts.append("no true surface to compare it with")
+    else:
+        ratio = surface.completion_ratio_5cm
+        rows = [
+            ["Accuracy", centimetres(surface.accuracy_m) or "–", "from the mesh to the true surface"],
+            ["Completion", centimetres(surface.completion_m) or "–", "from the true surface to the mesh"],
+            ["Completion ratio", "–" if ratio is None else percent(ratio), "of the true surface within 5 cm"],
+        ]
     return section("mesh", title, element("p", " · ".join(facts)), views, table(("", "", ""), rows) if rows else None)
 
 
 def views_of(run: RunData, limit: int | None = None) -> list[MeshView]:
     """Pictures of the run's mesh; none where it has no mesh, or one that can't be read any more."""
-    from warpslam.evaluation import load_mesh
-
     if not run.folder.mesh.is_file():
         return []
     mesh = load_mesh(run.folder.mesh)
@@ -283,8 +284,6 @@ def views_of(run: RunData, limit: int | None = None) -> list[MeshView]:
 
 
 def _mesh_figure(view: MeshView, first: bool) -> Html:
-    from warpslam.report.pictures import VIEW_HEIGHT, VIEW_WIDTH
-
     picture = element("image", href=view.uri, width=VIEW_WIDTH, height=VIEW_HEIGHT)
     path = None
     if view.path is not None:
@@ -297,7 +296,7 @@ def _mesh_figure(view: MeshView, first: bool) -> Html:
 def keyframes_section(run: RunData) -> Html:
     """Keyframes along the path, and which of them see the same."""
     title = "Keyframes"
-    frames = run.figure("keyframes", "frames")
+    frames = run.metrics.keyframes.frames
     if not frames or not len(run.poses):
         return section("keyframes", title, missing("The run recorded no keyframes."))
     axes = upright_axes(run.poses)
@@ -306,7 +305,7 @@ def keyframes_section(run: RunData) -> Html:
     frames = [frame for frame in frames if frame < len(ground)]
     points = [("keyframe", f"keyframe {n}: frame {numbers[frame]}", ground[frame]) for n, frame in enumerate(frames)]
     pairs = [
-        (a, b, share) for a, b, share in run.figure("keyframes", "overlaps") or []
+        (a, b, share) for a, b, share in run.metrics.keyframes.overlaps
         if share >= SHOWN_OVERLAP and max(a, b) < len(frames)
     ]  # fmt: skip
     links = [

@@ -40,35 +40,41 @@ _KEPT_TO_RESUME = ("checkpoint.previous.safetensors", "checkpoint.safetensors", 
 
 
 class RunFolder:
-    """Paths of one run.
-
-    ``config`` effective settings, ``trajectory`` and ``ground_truth`` in TUM format, ``frames`` (status of each) and
-    ``frame_records`` (the same with losses, for the report), ``mesh`` and ``forecast_mesh``, ``map`` for later
-    rendering, ``metrics``, ``timing``, ``source`` (how to open the input again), ``log``, ``report``, the plots, and
-    the images of the panels as arrays. While a run is under way, ``checkpoint`` and ``previous_checkpoint`` (see
-    `warpslam.pipeline.checkpoints`).
-    """
+    """Paths of one run."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.config = self.path / "config.yaml"
+        """Settings in effect."""
         self.trajectory = self.path / "trajectory.tum"
+        """Estimated poses in the TUM format."""
         self.ground_truth = self.path / "ground_truth.tum"
+        """True poses of the same frames."""
         self.mesh = self.path / "mesh.ply"
         self.forecast_mesh = self.path / "mesh_forecast.ply"
+        """Mesh with what the coarse level suggests where nothing was seen."""
         self.map = self.path / "map.safetensors"
+        """Map, for renderings and meshes later."""
         self.checkpoint = self.path / "checkpoint.safetensors"
+        """While a run is under way; see `warpslam.pipeline.checkpoints`."""
         self.previous_checkpoint = self.path / "checkpoint.previous.safetensors"
         self.frames = self.path / "frames.csv"
+        """Status of each frame."""
         self.metrics = self.path / "metrics.json"
+        """Figures; see `warpslam.runs.metrics`."""
         self.timing = self.path / "timing.json"
+        """Seconds by stage, phase and frame."""
         self.frame_records = self.path / "frames.json"
+        """Status of each frame with its losses, for the report; see `warpslam.runs.record.RunRecord.to_rows`."""
         self.source = self.path / "input.json"
+        """How to open the input again."""
         self.log = self.path / "log.txt"
         self.top_view = self.path / "trajectory_top_view.png"
         self.error_plot = self.path / "error_over_time.png"
         self.panels = self.path / "panels.png"
+        """Frames beside what the map renders from their poses."""
         self.panel_images = self.path / "panels.npz"
+        """The images of that figure as arrays."""
         self.report = self.path / "report.html"
 
     @classmethod
@@ -117,6 +123,11 @@ class RunFolder:
         for name in set(_WRITTEN_FILES) - set(_KEPT_TO_RESUME):
             (self.path / name).unlink(missing_ok=True)
 
+    def remove_checkpoints(self) -> None:
+        """Remove what a run could go on from; once it is over, its map holds all that they do."""
+        for path in (self.checkpoint, self.previous_checkpoint):
+            path.unlink(missing_ok=True)
+
     def require(self, file: Path, remedy: str) -> Path:
         """Return ``file``, or raise `DatasetError` with ``remedy`` if the run did not write it."""
         if not file.is_file():
@@ -136,7 +147,7 @@ class RunFolder:
         self.require(self.source, "so its input frames are unknown")
         fields = read_json(self.source)
         try:
-            return Source(**fields)
+            return Source.from_dict(fields)
         except TypeError as error:
             raise DatasetError(f"{self.source}: expected path, dataset, camera and command ({error})") from error
 

@@ -12,14 +12,16 @@ from warpslam.storage.tum import associate, read_tum
 
 @dataclass(frozen=True)
 class GivenPoses:
-    """Poses that a file gives to frames, by time.
-
-    path: File. times: [s], shape (N,). poses: T_world_camera, shape (N, 4, 4).
-    """
+    """Poses that a file gives to frames, by time."""
 
     path: Path
+    """The file."""
+
     times: np.ndarray
+    """[s], shape (N,)."""
+
     poses: np.ndarray
+    """T_world_camera, shape (N, 4, 4)."""
 
     @classmethod
     def read(cls, path: str | Path) -> GivenPoses:

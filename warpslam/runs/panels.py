@@ -13,19 +13,22 @@ from warpslam.errors import DatasetError
 
 @dataclass(frozen=True)
 class Panel:
-    """One frame as it came in and as the map renders it.
-
-    rgb: Input colour, uint8, (H, W, 3).
-    depth: Input depth [m], (H, W), 0 = missing.
-    rendered_rgb: Float, (H, W, 3), 0..1.
-    rendered_depth: Depth [m], (H, W).
-    """
+    """One frame as it came in and as the map renders it."""
 
     index: int
+    """Number in the sequence."""
+
     rgb: np.ndarray
+    """Input colour, uint8, (H, W, 3)."""
+
     depth: np.ndarray
+    """Input depth [m], (H, W), 0 = missing."""
+
     rendered_rgb: np.ndarray
+    """Float, (H, W, 3), 0..1."""
+
     rendered_depth: np.ndarray
+    """Depth [m], (H, W)."""
 
 
 def save_panels(path: Path, panels: list[Panel]) -> None:

@@ -1,71 +1,257 @@
-"""What has become of a run so far."""
+"""What has become of a run: held once, by the run, its checkpoints and its report."""
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass, field
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpslam.evaluation import AteResult, ReconstructionResult
-from warpslam.runs.folder import RunFolder
+from warpslam.frames import FrameResult, FrameStatus
 
 if TYPE_CHECKING:
-    from warpslam.frames import FrameResult
+    from warpslam.evaluation import AteResult, ReconstructionResult
+    from warpslam.runs.folder import RunFolder
+    from warpslam.runs.metrics import RunMetrics
+
+UNREADABLE = "unreadable"
+FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
+"""How a run ended. After ctrl-C everything up to then is written."""
+
+# Beside its number in the sequence; the other fields of a result are in timing.json and trajectory.tum.
+_ROW_FIELDS = ("timestamp", "status", "message", "inliers", "depth_error", "losses")
+# A report says what a file has, even if that is no status of ours.
+_STATUSES = {str(status): status for status in FrameStatus}
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A frame that did not get as far as the method: it can't be read, or has no pose where it must have one."""
+
+    index: int
+    """Number in the sequence."""
+
+    message: str
+    """Why."""
+
+
+@dataclass
+class RunRecord:
+    """One account of a run."""
+
+    frame_indices: list[int] = field(default_factory=list)
+    """Number in the sequence of each frame that was processed."""
+
+    truth_poses: list[np.ndarray] = field(default_factory=list)
+    """True T_world_camera of each of them, (4, 4); NaN where unknown."""
+
+    results: list[FrameResult] = field(default_factory=list)
+    """What the method made of each of them."""
+
+    left_out: list[LeftOut] = field(default_factory=list)
+    """The others, in their order."""
+
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    """Time by stage [s], without what is still going on; see `seconds_so_far`."""
+
+    first_index: int = 0
+    """Frames that the map had seen before the run."""
+
+    position: int = 0
+    """Frames of the selection that are done, those left out included."""
+
+    digests: dict[int, str] = field(default_factory=dict)
+    """SHA-256 of the first frame and of that of the last checkpoint, by their numbers in the sequence."""
+
+    _running: dict[str, float] = field(default_factory=dict, repr=False, compare=False)
+
+    def add(self, frame_index: int, truth: np.ndarray, result: FrameResult) -> None:
+        """A frame was processed."""
+        self.frame_indices.append(frame_index)
+        self.truth_poses.append(truth)
+        self.results.append(result)
+
+    def leave_out(self, frame_index: int, message: str) -> None:
+        """A frame could not be used."""
+        self.left_out.append(LeftOut(frame_index, message))
+
+    @property
+    def frames(self) -> list[tuple[int, FrameResult]]:
+        """Number in the sequence and result of each processed frame."""
+        return list(zip(self.frame_indices, self.results, strict=True))
+
+    @property
+    def statuses(self) -> list[FrameStatus]:
+        """Status of each processed frame."""
+        return [result.status for result in self.results]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Processed frames by status, and those left out."""
+        counts = Counter(self.statuses)
+        return {
+            "processed": len(self.results),
+            UNREADABLE: len(self.left_out),
+            **{status: counts.get(status, 0) for status in FrameStatus},
+        }
+
+    @property
+    def usable(self) -> list[int]:
+        """Positions of the processed frames that were not skipped."""
+        return [position for position, result in enumerate(self.results) if result.status != FrameStatus.SKIPPED]
+
+    @property
+    def truth(self) -> np.ndarray:
+        """True poses, shape (N, 4, 4), NaN where unknown."""
+        return np.array(self.truth_poses, np.float64).reshape(-1, 4, 4)
+
+    @property
+    def has_truth(self) -> bool:
+        """Whether the true pose of a frame is known."""
+        return bool(np.isfinite(self.truth).all(axis=(1, 2)).any())
+
+    @property
+    def losses(self) -> dict[str, np.ndarray]:
+        """Values of each loss, shape (N,), NaN where a frame has none."""
+        names = sorted({name for result in self.results for name in result.losses})
+        return {name: np.array([result.losses.get(name, np.nan) for result in self.results]) for name in names}
+
+    @contextmanager
+    def clock(self, stage: str) -> Iterator[None]:
+        """Add the time of a block to a stage."""
+        start = self._running[stage] = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._running.pop(stage, None)
+            self.seconds[stage] += time.perf_counter() - start
+
+    def seconds_so_far(self) -> dict[str, float]:
+        """Time by stage [s], with what is still going on."""
+        now = time.perf_counter()
+        going_on = {stage: self.seconds.get(stage, 0.0) + now - start for stage, start in self._running.items()}
+        return {**self.seconds, **going_on}
+
+    def to_rows(self) -> dict[str, Any]:
+        """Content of frames.json: what became of each frame."""
+        rows = [
+            {"index": index, **{name: getattr(result, name) for name in _ROW_FIELDS}} for index, result in self.frames
+        ]
+        return {"frames": rows, "left_out": [vars(frame) for frame in self.left_out]}
+
+    @classmethod
+    def from_rows(cls, content: dict[str, Any], poses: np.ndarray, truth: np.ndarray | None) -> RunRecord:
+        """What frames.json and the trajectories of a run tell of it.
+
+        Args:
+            content: See `to_rows`; JSON has null for NaN.
+            poses: Estimated poses, shape (N, 4, 4).
+            truth: True ones, NaN where unknown; None where there are none at all.
+
+        Raises:
+            KeyError: A field is missing.
+            TypeError: A field is unknown, or not of its kind.
+            ValueError: The number of frames is not that of the poses.
+        """
+        record = cls(left_out=[LeftOut(**frame) for frame in content["left_out"]])
+        truth = np.full((len(poses), 4, 4), np.nan) if truth is None else truth
+        for position, (row, pose, true_pose) in enumerate(zip(content["frames"], poses, truth, strict=True)):
+            # Early files have no depth error.
+            row = {"depth_error": None, **row}
+            values = {name: _known(row[name]) for name in _ROW_FIELDS}
+            values["status"] = _STATUSES.get(row["status"], row["status"])
+            values["losses"] = {name: _known(value) for name, value in row["losses"].items()}
+            record.add(row["index"], true_pose, FrameResult(index=position, T_world_camera=pose, **values))
+        return record
+
+    def to_state(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """Header and arrays for a checkpoint."""
+        header = {
+            "position": self.position,
+            "frame_indices": self.frame_indices,
+            "left_out": [vars(frame) for frame in self.left_out],
+            "seconds": self.seconds_so_far(),
+            "first_index": self.first_index,
+            "digests": list(self.digests.items()),
+            "results": [
+                {f.name: getattr(result, f.name) for f in fields(FrameResult) if f.name != "T_world_camera"}
+                for result in self.results
+            ],
+        }
+        poses = np.array([result.T_world_camera for result in self.results], np.float64).reshape(-1, 4, 4)
+        return header, {"run_truth_poses": self.truth, "run_poses": poses}
+
+    @classmethod
+    def from_state(cls, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> RunRecord:
+        """What `to_state` gave; takes its arrays out of ``arrays``.
+
+        Raises:
+            KeyError: A field is missing.
+            TypeError: A field is unknown, or not of its kind.
+            ValueError: Lists have different lengths, or a value is not of its kind.
+        """
+        poses, truth = arrays.pop("run_poses"), arrays.pop("run_truth_poses")
+        record = cls(
+            position=int(header["position"]),
+            frame_indices=[int(index) for index in header["frame_indices"]],
+            truth_poses=list(truth.reshape(-1, 4, 4)),
+            results=[
+                FrameResult(T_world_camera=pose, **{**row, "status": FrameStatus(row["status"])})
+                for pose, row in zip(poses, header["results"], strict=True)
+            ],
+            left_out=[LeftOut(int(frame["index"]), str(frame["message"])) for frame in header["left_out"]],
+            first_index=int(header["first_index"]),
+            digests={int(index): str(digest) for index, digest in header["digests"]},
+        )
+        record.seconds.update({str(stage): float(seconds) for stage, seconds in header["seconds"].items()})
+        if not len(record.results) == len(record.frame_indices) == len(record.truth_poses):
+            raise ValueError("its lists have different lengths")
+        return record
+
+
+def _known(value: Any) -> Any:
+    return np.nan if value is None else value
 
 
 @dataclass(frozen=True)
 class Progress:
-    """State of a run after a frame.
-
-    done, total: Frames processed so far and selected.
-    ate_rmse: ATE RMSE so far, aligned [m]; None without ground truth.
-    fps: Frames a second so far, set-up left out.
-    """
+    """State of a run after a frame."""
 
     done: int
+    """Frames done so far, those left out included."""
+
     total: int
+    """Frames that were selected."""
+
     result: FrameResult
+    """Of the last frame."""
+
     ate_rmse: float | None
+    """ATE RMSE so far, aligned [m]; None without ground truth."""
+
     fps: float
+    """Frames a second so far, set-up left out."""
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run came to.
-
-    status: "finished", "interrupted" (by ctrl-C; everything up to then is written) or "failed".
-    metrics: Content of metrics.json.
-    """
+    """What a run came to."""
 
     folder: RunFolder
+    """Where everything is written."""
+
     status: str
-    metrics: dict[str, Any]
+    """`FINISHED` or `INTERRUPTED`; a run that fails raises."""
+
+    metrics: RunMetrics
+    """Content of metrics.json."""
+
     ate: AteResult | None
+    """Trajectory error after alignment; None without ground truth."""
+
     reconstruction: ReconstructionResult | None
-
-
-@dataclass
-class RunProgress:
-    """How far a run has come.
-
-    position: Frames of the selection that are done, unreadable ones included. frame_indices, truth_poses (4, 4; NaN
-    where unknown), results: Of each processed frame. left_out: Index and message of each unreadable one. seconds: By
-    stage. first_index: Frames that the map had seen before. digests: SHA-256 of the first and the last frame, by frame
-    number.
-    """
-
-    position: int = 0
-    frame_indices: list[int] = field(default_factory=list)
-    truth_poses: list[np.ndarray] = field(default_factory=list)
-    results: list[FrameResult] = field(default_factory=list)
-    left_out: list[dict[str, Any]] = field(default_factory=list)
-    seconds: dict[str, float] = field(default_factory=dict)
-    first_index: int = 0
-    digests: dict[int, str] = field(default_factory=dict)
-
-
-def result_row(result: FrameResult) -> dict[str, Any]:
-    """A result without its pose, as JSON takes it."""
-    return {f.name: getattr(result, f.name) for f in dataclasses.fields(result) if f.name != "T_world_camera"}
+    """Surface errors; None without a true surface or a mesh."""

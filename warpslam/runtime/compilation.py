@@ -7,7 +7,6 @@ milliseconds. Warp releases the GIL while it compiles, so on the CPU two modules
 from __future__ import annotations
 
 import importlib
-import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -18,6 +17,7 @@ from pathlib import Path
 import warp as wp
 
 from warpslam.errors import ConfigError
+from warpslam.runtime.cores import process_cores
 
 _STAGES = (
     "rays",
@@ -32,7 +32,7 @@ _STAGES = (
 )
 _PYTHON_MODULES = {
     "warpslam.rays": ("pixels", "rays", "rejection", "samples"),
-    "warpslam.views": ("frustum", "seen", "visibility"),
+    "warpslam.views": ("frustum", "images", "seen", "visibility"),
     **{f"warpslam.decoder_{target}": ("decoder.build",) for target in ("cpu", "cuda")},
     **{f"warpslam.imap_{target}": ("imap_network",) for target in ("cpu", "cuda")},
 }
@@ -85,8 +85,7 @@ def compile_kernels(device: wp.Device, report: Report | None = None, extra: Sequ
         wp.force_load(device, [module], max_workers=0)
 
     names = [*module_names(target), *extra]
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return _each(names, target, load, report, 1 if device.is_cuda else min(cores, _WORKERS))
+    return _each(names, target, load, report, 1 if device.is_cuda else min(len(process_cores()), _WORKERS))
 
 
 def compile_for_architecture(

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import os
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
-import warp as wp
+import psutil
 
 from warpslam.errors import ConfigError
+
+if TYPE_CHECKING:
+    import warp as wp
 
 MAX_SLICES = 8
 
@@ -21,10 +25,17 @@ def slice_count(device: wp.Device) -> int:
     return max(1, min(_core_count(), MAX_SLICES))
 
 
+def process_cores() -> list[int]:
+    """Numbers of the cores that this process may use, ascending."""
+    process = psutil.Process()
+    # (macOS pins nothing.)
+    return sorted(process.cpu_affinity()) if hasattr(process, "cpu_affinity") else list(range(psutil.cpu_count() or 1))
+
+
 @lru_cache(maxsize=1)
 def _core_count() -> int:
     """Cores that this process may use; fewer where several share a machine and WARPSLAM_THREADS says so."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = len(process_cores())
     text = os.environ.get("WARPSLAM_THREADS", "")
     if not text:
         return cores

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-import os
+import runpy
 import sys
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import warp as wp
+import psutil
 
-PACKAGES = ("warp-lang", "torch", "numpy", "trimesh", "opencv-python-headless", "open3d")
+if TYPE_CHECKING:
+    import warp as wp
+
+PACKAGES = ("warp-lang", "torch", "numpy", "scipy", "trimesh", "opencv-python-headless", "open3d")
 
 
 def package_versions() -> dict[str, str | None]:
@@ -23,33 +29,47 @@ def package_versions() -> dict[str, str | None]:
     return versions
 
 
-def resident_bytes() -> int:
-    """Memory that this process holds; where the system does not tell, the most it has held."""
+@dataclass(frozen=True)
+class TorchBuild:
+    """Which of PyTorch's builds is installed."""
+
+    target: str
+    """What it computes on: "CPU only", "CUDA 12.8", "ROCm 6.4"."""
+    bytes: int
+    """Of its folder; those of CUDA keep gigabytes more in packages of their own."""
+
+
+def torch_build() -> TorchBuild | None:
+    """The build of PyTorch, told without loading it, which takes seconds; None where there is none."""
+    spec = find_spec("torch")
+    if spec is None or spec.origin is None:
+        return None
+    folder = Path(spec.origin).parent
     try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        facts = runpy.run_path(str(folder / "version.py"))
     except OSError:
-        import resource
-
-        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-    return pages * os.sysconf("SC_PAGE_SIZE")
-
-
-def free_gigabytes(device: wp.Device) -> float | None:
-    """Memory of a device, or of the machine for the CPU, that is not in use [GB]; None where that can't be told."""
-    if device.is_cuda:
-        return device.free_memory / 1e9
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        return next(int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")) * 1024 / 1e9
-    except (OSError, StopIteration, IndexError, ValueError):  # not Linux
         return None
+    names = (("CUDA", facts.get("cuda")), ("ROCm", facts.get("hip")), ("XPU", facts.get("xpu")))
+    target = next((f"{name} {number}" for name, number in names if number), "CPU only")
+    return TorchBuild(target, sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()))
 
 
-def peak_memory_mib() -> float | None:
-    """The most memory that this process has held [MiB]; None where that can't be told."""
-    try:
-        import resource
-    except ImportError:  # not on Windows
-        return None
+def resident_bytes() -> int:
+    """Memory that this process holds."""
+    return int(psutil.Process().memory_info().rss)
+
+
+def free_gigabytes(device: wp.Device) -> float:
+    """Memory of a device, or of the machine for the CPU, that is not in use [GB]."""
+    return (device.free_memory if device.is_cuda else psutil.virtual_memory().available) / 1e9
+
+
+def peak_memory_mib() -> float:
+    """The most memory that this process has held [MiB]."""
+    # psutil knows the peak on Windows only, which is where the standard library does not.
+    if sys.platform == "win32":
+        return float(psutil.Process().memory_info().peak_wset) / 2**20
+    import resource
+
     unit = 2**20 if sys.platform == "darwin" else 2**10
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

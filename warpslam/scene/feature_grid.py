@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warpslam.field.decoders import LEVELS
 from warpslam.kernels import grid as grid_kernels
 from warpslam.kernels.grid import Lattice, Level, Vec32
-
-LEVELS = ("coarse", "middle", "fine", "color")
 
 
 @dataclass(frozen=True)

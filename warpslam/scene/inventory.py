@@ -12,6 +12,7 @@ from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe, overlap_fractions
 from warpslam.scene.mapped_views import SEEN_STRIDE, ObservedView, SeenDepth
 from warpslam.scene.scene_map import SceneMap
+from warpslam.spread import spread
 
 OBSERVED_CELL = 0.16  # [m]
 OBSERVED_RAYS = 1000  # a frame, about; at 3 m they lie closer than a cell
@@ -68,7 +69,7 @@ def observed_volume(views: Sequence[ObservedView]) -> float:
         v, u = np.nonzero(depth)
         if not len(v):
             continue
-        rays = np.stack([(u * stride - camera.cx) / camera.fx, (v * stride - camera.cy) / camera.fy, np.ones(len(u))])
+        rays = camera.backproject(u * stride, v * stride, 1.0).T
         steps = np.arange(0.0, depth.max(), OBSERVED_CELL / 2)
         z = steps[:, None] * np.ones(len(u))
         local = (rays[:, None] * z)[:, z <= depth[v, u]]
@@ -87,7 +88,7 @@ def keyframe_overlaps(
     """
     if not seen or not keyframes:
         return []
-    chosen = np.unique(np.linspace(0, len(keyframes) - 1, min(len(keyframes), MAX_KEYFRAMES)).round().astype(int))
+    chosen = spread(len(keyframes), MAX_KEYFRAMES)
     poses = [keyframes[n].pose for n in chosen]
     mapped = np.array([one.index for one in seen])
     rng = np.random.default_rng(0)

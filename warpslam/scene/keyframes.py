@@ -49,16 +49,14 @@ def overlap_fractions(
     d = depth[v, u].astype(np.float64)
     s = np.linspace(0.0, 1.0, OVERLAP_SAMPLES)
     z = 0.8 * d[:, None] * (1 - s) + (d[:, None] + 0.5) * s
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(u))], axis=1)
+    rays = camera.backproject(u, v, 1.0)
     points = (z[..., None] * rays[:, None]).reshape(-1, 3) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
     fractions = np.zeros(len(keyframe_poses))
     border = OVERLAP_BORDER
     for n, T in enumerate(keyframe_poses):
         q = (points - T[:3, 3]) @ T[:3, :3]
         in_front = q[:, 2] > 1e-5
-        depth_safe = np.where(in_front, q[:, 2], 1.0)
-        x = camera.fx * q[:, 0] / depth_safe + camera.cx
-        y = camera.fy * q[:, 1] / depth_safe + camera.cy
+        x, y = camera.project(q[:, 0], q[:, 1], np.where(in_front, q[:, 2], 1.0))
         inside = (x > border) & (x < camera.width - border) & (y > border) & (y < camera.height - border)
         fractions[n] = np.mean(inside & in_front)
     return fractions

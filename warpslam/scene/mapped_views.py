@@ -67,6 +67,4 @@ class ObservedView:
         """World points [m] of the pixels with depth, float64, shape (N, 3)."""
         v, u = np.nonzero(self.depth)
         z = self.depth[v, u].astype(np.float64)
-        camera = self.intrinsics
-        local = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
-        return local @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
+        return self.intrinsics.backproject(u, v, z) @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]

@@ -11,14 +11,14 @@ import warp as wp
 from warpslam.config import GridConfig
 from warpslam.errors import InputError, MapSizeError
 from warpslam.field.arrays import FieldArrays
-from warpslam.field.decoders import Decoders
+from warpslam.field.decoders import LEVELS, Decoders
 from warpslam.field.packing import PackedDecoder
 from warpslam.field.passes import query
 from warpslam.field.ray_batch import RayBatch
 from warpslam.runtime.cores import slice_count
 from warpslam.runtime.environment import free_gigabytes
 from warpslam.runtime.phases import phase
-from warpslam.scene.feature_grid import LEVELS, FeatureGrid, GridState
+from warpslam.scene.feature_grid import FeatureGrid, GridState
 
 QUERY_CHUNK = 1 << 16
 _log = logging.getLogger(__name__)

@@ -13,20 +13,18 @@ from warpslam.camera import Intrinsics
 
 @dataclass(frozen=True)
 class Frame:
-    """One RGB-D frame.
-
-    index: Position in the sequence.
-    timestamp: Time [s]; readers of formats without times use index / 30.
-    rgb: Colour image, uint8, shape (H, W, 3), RGB order.
-    depth: z-depth [m], float32, shape (H, W), 0 = missing.
-    T_world_camera: Ground-truth camera-to-world transform, float64, shape (4, 4), OpenCV axes; None where unknown.
-    """
+    """One RGB-D frame."""
 
     index: int
+    """Position in the sequence."""
     timestamp: float
+    """Time [s]; readers of formats without times use index / 30."""
     rgb: np.ndarray
+    """Colour image, uint8, shape (H, W, 3), RGB order."""
     depth: np.ndarray
+    """z-depth [m], float32, shape (H, W), 0 = missing."""
     T_world_camera: np.ndarray | None = None
+    """Ground-truth camera-to-world transform, float64, shape (4, 4), OpenCV axes; None where unknown."""
 
 
 class RgbdSequence(ABC):

@@ -20,22 +20,20 @@ _DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 
 @dataclass(frozen=True)
 class Calibration:
-    """Camera of the images as stored, and what the reader does to them before returning a frame.
-
-    stored: Intrinsics of the stored depth images (and of the colour images once they have that size).
-    depth_scale: Stored depth units per metre.
-    distortion: OpenCV coefficients (k1, k2, p1, p2, k3, ...) of the colour images; empty = none.
-    resize: Size (width, height) to which frames are resized first; None = as stored.
-    crop: Border [pixels] cut from every side after resizing.
-    source: Where the numbers come from, for messages.
-    """
+    """Camera of the images as stored, and what the reader does to them before returning a frame."""
 
     stored: Intrinsics
+    """Intrinsics of the stored depth images (and of the colour images once they have that size)."""
     depth_scale: float
+    """Stored depth units per metre."""
     distortion: tuple[float, ...] = ()
+    """OpenCV coefficients (k1, k2, p1, p2, k3, ...) of the colour images; empty = none."""
     resize: tuple[int, int] | None = None
+    """Size (width, height) to which frames are resized first; None = as stored."""
     crop: int = 0
+    """Border [pixels] cut from every side after resizing."""
     source: str = "camera"
+    """Where the numbers come from, for messages."""
 
     @property
     def intrinsics(self) -> Intrinsics:

@@ -19,6 +19,7 @@ from warpslam.frames import exposure_fault, read_images
 from warpslam.sequences.base import Frame, RgbdSequence
 from warpslam.sequences.files import FileSequence, frame_number
 from warpslam.sequences.pose_convention import CONVENTIONS, EXPECTED, DepthView, agreement, moving_pairs
+from warpslam.spread import spread
 
 OK, WARNING, ERROR = "ok", "warning", "error"
 MAX_DEPTH = 10.0
@@ -41,15 +42,16 @@ _NAMED = 3  # frames or files named in a message
 
 @dataclass(frozen=True)
 class Finding:
-    """check: What was looked at. severity: "error", "warning" or "ok". message: What is so, and where.
-
-    remedy: What to do or type; empty where nothing is wrong.
-    """
+    """What one check came to."""
 
     check: str
+    """What was looked at."""
     severity: str
+    """One of "error", "warning" and "ok"."""
     message: str
+    """What is so, and where."""
     remedy: str = ""
+    """What to do or type; empty where nothing is wrong."""
 
     def __str__(self) -> str:
         return f"{self.check}: {self.message}" + (f"; {self.remedy}" if self.remedy else "")
@@ -57,11 +59,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """folder: What was checked. name: Of the sequence; empty if it can't be opened. frames: How many it has."""
+    """All findings about one folder."""
 
     folder: str
+    """What was checked."""
     name: str = ""
+    """Of the sequence; empty if it can't be opened."""
     frames: int = 0
+    """How many it has."""
     findings: tuple[Finding, ...] = field(default_factory=tuple)
 
     @property
@@ -132,7 +137,7 @@ def check_sequence(
     """
     frames = range(len(sequence)) if frames is None else frames
     count = len(frames) if sample_count is None else min(sample_count, len(frames))
-    chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))]
+    chosen = [frames[i] for i in spread(len(frames), count)]
     samples = [_sample(sequence, index) for index in chosen]
     findings = [*_check_frames(samples), *_check_files(sequence, frames, thorough), *_check_times(sequence, frames)]
     good = [sample.frame for sample in samples if sample.frame is not None]

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from warpslam.camera import Intrinsics
+from warpslam.poses import rotation_angles
+from warpslam.spread import spread
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -35,10 +37,12 @@ _POINT_COUNT = 5000
 
 @dataclass(frozen=True)
 class DepthView:
-    """depth: z-depth [m], (H, W), 0 = missing. pose: Matrix as stored, (4, 4)."""
+    """What one frame measured, and from where."""
 
     depth: np.ndarray
+    """z-depth [m], (H, W), 0 = missing."""
     pose: np.ndarray
+    """Matrix as stored, (4, 4)."""
 
 
 def moving_pairs(poses: np.ndarray, count: int) -> list[tuple[int, int]]:
@@ -53,13 +57,11 @@ def moving_pairs(poses: np.ndarray, count: int) -> list[tuple[int, int]]:
     """
     known = np.isfinite(poses).all(axis=(1, 2))
     pairs = []
-    for first in np.unique(np.linspace(0, max(len(poses) - 2, 0), count).round().astype(int)):
+    for first in spread(len(poses) - 1, count):
         if not known[first]:
             continue
         later = np.flatnonzero(known[first + 1 :]) + first + 1
-        rotations = poses[later, :3, :3]
-        trace = np.einsum("nij,ij->n", rotations, poses[first, :3, :3])
-        angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+        angle = rotation_angles(poses[first, :3, :3].T @ poses[later, :3, :3])
         shift = np.linalg.norm(poses[later, :3, 3] - poses[first, :3, 3], axis=1)
         enough = later[((angle > _MIN_ANGLE) | (shift > _MIN_SHIFT)) & (angle < _MAX_ANGLE)]
         if len(enough):
@@ -85,10 +87,7 @@ def agreement(
         points = _points(a.depth * depth_factor, camera) @ T_b_a[:3, :3].T + T_b_a[:3, 3]
         z = points[:, 2]
         ahead = z > 1e-6
-        u, v = (
-            np.rint(f * points[ahead, axis] / z[ahead] + c)
-            for f, axis, c in ((camera.fx, 0, camera.cx), (camera.fy, 1, camera.cy))
-        )
+        u, v = map(np.rint, camera.project(*points[ahead].T))
         inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
         measured = b.depth[v[inside].astype(int), u[inside].astype(int)] * depth_factor
         valid = measured > 0
@@ -104,4 +103,4 @@ def _points(depth: np.ndarray, camera: Intrinsics) -> np.ndarray:
     stride = max(1, int(np.sqrt(depth.size / _POINT_COUNT)))
     v, u = np.nonzero(depth[::stride, ::stride])
     z = depth[::stride, ::stride][v, u].astype(np.float64)
-    return np.stack([(u * stride - camera.cx) / camera.fx * z, (v * stride - camera.cy) / camera.fy * z, z], axis=1)
+    return camera.backproject(u * stride, v * stride, z)

@@ -11,7 +11,9 @@ import numpy as np
 from warpslam.errors import DatasetError
 from warpslam.sequences.calibration import find_calibration
 from warpslam.sequences.files import FileSequence
-from warpslam.sequences.pose_files import read_lines, read_tum_poses
+from warpslam.sequences.pose_files import read_tum_poses
+from warpslam.storage.text_lines import read_lines
+from warpslam.storage.tum import nearest
 
 MAX_TIME_DIFFERENCE = 0.08
 """Colour, depth and pose of a frame lie within this time [s] of each other."""
@@ -27,7 +29,7 @@ class TumRgbdSequence(FileSequence):
     def __init__(self, folder: Path, camera: str | None = None) -> None:
         rgb_times, rgb_files = _read_list(folder / "rgb.txt")
         depth_times, depth_files = _read_list(folder / "depth.txt")
-        depth_index, depth_gap = _nearest(rgb_times, depth_times)
+        depth_index, depth_gap = nearest(rgb_times, depth_times)
         keep = depth_gap < MAX_TIME_DIFFERENCE
         pose_file = next((file for file in (folder / "groundtruth.txt", folder / "pose.txt") if file.is_file()), None)
         poses = None
@@ -35,7 +37,7 @@ class TumRgbdSequence(FileSequence):
             pose_times, all_poses = read_tum_poses(pose_file)
             if not len(pose_times):
                 raise DatasetError(f"{pose_file}: holds no pose; fetch it again or remove it")
-            pose_index, pose_gap = _nearest(rgb_times, pose_times)
+            pose_index, pose_gap = nearest(rgb_times, pose_times)
             keep &= pose_gap < MAX_TIME_DIFFERENCE
         remarks = []
         if not keep.all():
@@ -95,16 +97,6 @@ def _read_list(path: Path) -> tuple[np.ndarray, list[Path]]:
         raise DatasetError(f"{path}: lists no images; fetch the file again")
     entries.sort()
     return np.array([time for time, _ in entries]), [file for _, file in entries]
-
-
-def _nearest(times: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """For each time the index of the nearest of ``others`` (ascending) and the difference [s]."""
-    right = np.clip(np.searchsorted(others, times), 1, max(len(others) - 1, 1))
-    pair = np.stack([right - 1, np.minimum(right, len(others) - 1)])
-    gaps = np.abs(others[pair] - times)
-    choice = np.argmin(gaps, axis=0)
-    along = np.arange(len(times))
-    return pair[choice, along], gaps[choice, along]
 
 
 def _thin_out(times: np.ndarray, candidates: np.ndarray) -> np.ndarray:

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
 from warpslam.errors import DatasetError
+from warpslam.storage.atomic import replacing
 
 
 def write_json(path: Path, value: Any) -> None:
     """Write `to_json` of a value; the file is replaced only once all is written."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(to_json(value) + "\n", encoding="utf-8")
-    os.replace(partial, path)
+    with replacing(path) as partial:
+        partial.write_text(to_json(value) + "\n", encoding="utf-8")
 
 
 def to_json(value: Any) -> str:

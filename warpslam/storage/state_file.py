@@ -1,40 +1,34 @@
 """Files of named arrays and one JSON header, written atomically and checked at load. Reading one can't run code.
 
-The layout is that of safetensors, which other tools read:
-
-    8 bytes   length n of the table, unsigned little-endian
-    n bytes   the table, JSON: {name: {"dtype", "shape", "data_offsets"}, ..., "__metadata__": {text: text}}
-    the rest  the arrays, little-endian and C-ordered, one behind the other
-
-The metadata hold the format's name and version, the header, and the SHA-256 of the table (with zeros in the place of
-the digest) and of all that follows. Nothing is decoded before the digest agrees, and no array is made that the file
-has no bytes for.
+They are safetensors files, which other tools read. All metadata are JSON text under one key, because with several keys
+the package safetensors writes other bytes each time: the format's name and version, the header, and the SHA-256 of the
+file with zeros in the place of the digest. No array is used before the digest agrees.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import math
-import os
 import struct
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
 
 from warpslam.errors import CheckpointError, ConfigError
+from warpslam.storage.atomic import replacing
 
 T = TypeVar("T")
 
-_DTYPES = {"U8": "<u1", "I8": "<i1", "U16": "<u2", "I32": "<i4", "I64": "<i8", "F32": "<f4", "F64": "<f8"}
-_NAMES = {np.dtype(code): name for name, code in _DTYPES.items()}
 _METADATA = "__metadata__"
+_KEY = "warpslam"
 _NO_DIGEST = "0" * 64
-_MAX_TABLE_BYTES = 1 << 30
+_CHUNK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -56,146 +50,124 @@ def write_state(path: Path, form: StateFormat, header: dict[str, Any], arrays: d
     ``path`` holds the old or the new content. The same content gives the same bytes.
 
     Raises:
-        CheckpointError: the file can't be written, for example because the disk is full.
+        CheckpointError: The file can't be written, for example because the disk is full.
     """
-    arrays = {name: _little_endian(array) for name, array in arrays.items()}
-    table: dict[str, Any] = {}
-    offset = 0
-    for name, array in arrays.items():
-        end = offset + array.nbytes
-        table[name] = {"dtype": _NAMES[array.dtype], "shape": list(array.shape), "data_offsets": [offset, end]}
-        offset = end
-    table[_METADATA] = {
-        "format": form.name,
-        "version": str(form.version),
-        "header": json.dumps(header),
-        "sha256": _NO_DIGEST,
-    }
-    blank = json.dumps(table).encode()
-    # Arrays begin at a multiple of 8 bytes, so that they can be used where they lie.
-    blank += b" " * (-len(blank) % 8)
-    digest = hashlib.sha256(blank)
-    for array in arrays.values():
-        digest.update(_bytes(array))
-    table[_METADATA]["sha256"] = digest.hexdigest()
-    text = json.dumps(table).encode().ljust(len(blank))
-
-    temporary = path.with_name(path.name + ".part")
+    metadata = {"format": form.name, "version": form.version, "sha256": _NO_DIGEST, "header": header}
+    native = {name: _native(array) for name, array in arrays.items()}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with open(temporary, "wb") as file:
-            file.write(struct.pack("<Q", len(text)) + text)
-            for array in arrays.values():
-                file.write(_bytes(array))
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-        sync_folder(path.parent)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        needed = (8 + len(text) + offset) / 1e6
-        raise CheckpointError(
-            f"{path}: can't be written ({error.strerror or error}); {needed:.1f} MB are needed there"
-        ) from error
-    return 8 + len(text) + offset
+        with replacing(path, durable=True) as partial:
+            save_file(native, partial, {_KEY: json.dumps(metadata)})
+            digest, place = _digest(partial, _NO_DIGEST)
+            with open(partial, "r+b") as file:
+                file.seek(place)
+                file.write(digest.encode())
+            return partial.stat().st_size
+    except (OSError, SafetensorError) as error:
+        needed = sum(array.nbytes for array in native.values()) / 1e6
+        reason = getattr(error, "strerror", None) or error
+        raise CheckpointError(f"{path}: can't be written ({reason}); {needed:.1f} MB are needed there") from error
 
 
 def read_state(path: Path, form: StateFormat) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays (read-only) of a file that `write_state` wrote.
+    """Header and arrays of a file that `write_state` wrote.
 
     Raises:
-        CheckpointError: the file is missing, truncated, altered, of another kind, or of another version.
+        CheckpointError: The file is missing, truncated, altered, of another kind, or of another version.
     """
     try:
-        content = path.read_bytes()
+        with open(path, "rb") as opened:
+            if opened.read(2) == b"PK":
+                raise CheckpointError(
+                    f"{path}: an .npz file of an early warpslam; this version can't read it: run again"
+                )
+        with safe_open(path, framework="numpy") as file:
+            metadata = _metadata(path, file.metadata())
+            if _digest(path, metadata["sha256"])[0] != metadata["sha256"]:
+                raise CheckpointError(
+                    f"{path}: field sha256 does not agree with the content, which is altered: use another copy"
+                )
+            _check_kind(path, metadata, form)
+            return metadata["header"], {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such file") from None
     except OSError as error:
-        raise CheckpointError(f"{path}: can't be read ({error.strerror})") from error
-    table, data = _open(path, content)
-    metadata = table.pop(_METADATA)
+        raise CheckpointError(f"{path}: can't be read ({error.strerror or error})") from error
+    except (SafetensorError, TypeError, ValueError) as error:
+        where = _damaged_entry(path)
+        what = f"field {where} is damaged" if where else "no state file of warpslam, truncated, or its table is damaged"
+        raise CheckpointError(f"{path}: {what} ({error}): use another copy") from None
+
+
+def _native(array: np.ndarray) -> np.ndarray:
+    # (ascontiguousarray alone would make a number an array of one.)
+    array = np.asarray(array)
+    return np.ascontiguousarray(array, array.dtype.newbyteorder("=")).reshape(array.shape)
+
+
+def _digest(path: Path, digest: str) -> tuple[str, int]:
+    """SHA-256 of a file with zeros in the place of the text ``digest``, and where in the file that stands."""
+    with open(path, "rb") as file:
+        (size,) = struct.unpack("<Q", file.read(8))
+        table = file.read(size)
+        place = table.find(digest.encode())
+        actual = hashlib.sha256(struct.pack("<Q", size) + table.replace(digest.encode(), _NO_DIGEST.encode(), 1))
+        while chunk := file.read(_CHUNK):
+            actual.update(chunk)
+    return actual.hexdigest(), 8 + place
+
+
+def _metadata(path: Path, found: dict[str, str] | None) -> dict[str, Any]:
+    """What stands under our key, each part of its type."""
+    try:
+        metadata = json.loads((found or {})[_KEY])
+        if not isinstance(metadata["header"], dict):
+            raise CheckpointError(f"{path}: field header is damaged (expected an object): use another copy")
+        texts = metadata["format"], metadata["sha256"]
+        if not all(isinstance(text, str) for text in texts) or len(metadata["sha256"]) != len(_NO_DIGEST):
+            raise TypeError("expected text")
+    except (KeyError, TypeError, ValueError, RecursionError) as error:
+        raise CheckpointError(
+            f"{path}: no state file of warpslam, or its metadata are damaged ({type(error).__name__}): use another copy"
+        ) from None
+    return metadata
+
+
+def _check_kind(path: Path, metadata: dict[str, Any], form: StateFormat) -> None:
     if metadata["format"] != form.name:
         raise CheckpointError(
             f"{path}: field format is {metadata['format']!r}, expected {form.name!r}: name {form.origin}"
         )
-    _check_version(path, metadata["version"], form)
+    version = metadata.get("version")
+    if version != form.version:
+        newer = isinstance(version, int) and version > form.version
+        remedy = "update warpslam" if newer else "load it with the warpslam that wrote it, or run again"
+        raise CheckpointError(f"{path}: field version is {version}, this warpslam reads {form.version}: {remedy}")
+
+
+def _damaged_entry(path: Path) -> str:
+    """The first array of a damaged file that can't be as the table has it; safetensors does not always name it."""
     try:
-        header = json.loads(metadata["header"])
-        if not isinstance(header, dict):
-            raise TypeError(f"expected an object, found {type(header).__name__}")
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"{path}: field header is damaged ({error!r}): use another copy") from None
-    return header, {name: _array(path, name, entry, data) for name, entry in table.items()}
+        with open(path, "rb") as file:
+            (size,) = struct.unpack("<Q", file.read(8))
+            table = json.loads(file.read(min(size, path.stat().st_size)))
+        rest = path.stat().st_size - 8 - size
+        for name, entry in table.items():
+            if name != _METADATA and not _is_possible(entry, rest):
+                return str(name)
+    except (OSError, struct.error, ValueError, TypeError, AttributeError, RecursionError):
+        pass
+    return ""
 
 
-def sync_folder(folder: Path) -> None:
-    """Make renames in a folder survive a power cut, where the system can."""
-    if not hasattr(os, "O_DIRECTORY"):  # Windows has no such call, and needs none
-        return
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+def _is_possible(entry: Any, size: int) -> bool:
     try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _open(path: Path, content: bytes) -> tuple[dict[str, Any], memoryview]:
-    """Table and data of a file whose digest agrees."""
-    if content[:2] == b"PK":
-        raise CheckpointError(f"{path}: an .npz file of an early warpslam; this version can't read it: run again")
-    (size,) = struct.unpack("<Q", content[:8]) if len(content) >= 8 else (0,)
-    if not 0 < size <= min(len(content) - 8, _MAX_TABLE_BYTES):
-        raise CheckpointError(f"{path}: no state file of warpslam, or truncated: use another copy")
-    text = content[8 : 8 + size]
-    try:
-        table = json.loads(text)
-        metadata = table[_METADATA]
-        digest = metadata["sha256"]
-        if not all(isinstance(metadata[name], str) for name in ("format", "version", "sha256")) or len(digest) != 64:
-            raise TypeError("expected text")
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
-        raise CheckpointError(
-            f"{path}: no state file of warpslam, or its table is damaged ({type(error).__name__}): use another copy"
-        ) from None
-    data = memoryview(content)[8 + size :]
-    actual = hashlib.sha256(text.replace(digest.encode(), _NO_DIGEST.encode(), 1))
-    actual.update(data)
-    if actual.hexdigest() != digest:
-        raise CheckpointError(f"{path}: field sha256 does not agree with the content, which is truncated or altered: "
-                              "use another copy")  # fmt: skip
-    return table, data
-
-
-def _check_version(path: Path, text: str, form: StateFormat) -> None:
-    if text == str(form.version):
-        return
-    newer = text.isdigit() and int(text[:9]) > form.version
-    remedy = "update warpslam" if newer else "load it with the warpslam that wrote it, or run again"
-    raise CheckpointError(f"{path}: field version is {text}, this warpslam reads {form.version}: {remedy}")
-
-
-def _array(path: Path, name: str, entry: Any, data: memoryview) -> np.ndarray:
-    try:
-        dtype, shape = np.dtype(_DTYPES[entry["dtype"]]), tuple(entry["shape"])
-        first, end = entry["data_offsets"]
-        if not all(type(number) is int and number >= 0 for number in (*shape, first, end)):
-            raise ValueError("sizes must be whole numbers")
-        if not (first <= end <= len(data) and math.prod(shape) * dtype.itemsize == end - first):
-            raise ValueError(f"shape {shape} needs other bytes than {first} to {end}")
-        return np.frombuffer(data[first:end], dtype).reshape(shape)
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{path}: field {name} is damaged ({error}): use another copy") from None
-
-
-def _little_endian(array: np.ndarray) -> np.ndarray:
-    # (ascontiguousarray alone would make a number an array of one.)
-    array = np.asarray(array)
-    return np.ascontiguousarray(array, array.dtype.newbyteorder("<")).reshape(array.shape)
-
-
-def _bytes(array: np.ndarray) -> memoryview:
-    return array.reshape(-1).data.cast("B") if array.size else memoryview(b"")
+        bits = int("".join(filter(str.isdigit, entry["dtype"])))
+        shape, (first, end) = entry["shape"], entry["data_offsets"]
+        whole = all(type(number) is int and number >= 0 for number in (*shape, first, end))
+        return whole and first <= end <= size and math.prod(shape) * bits == 8 * (end - first)
+    except (KeyError, TypeError, ValueError):
+        return False
 
 
 class StateFields:
@@ -220,13 +192,6 @@ class StateFields:
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise self.damaged(name, "it holds NaN or infinity")
         return array
-
-    def texts(self, name: str, count: int, choices: Collection[str]) -> list[str]:
-        """``count`` words, each one of ``choices``."""
-        value = self.header.get(name)
-        if not isinstance(value, list) or len(value) != count or not all(word in choices for word in value):
-            raise self.damaged(name, f"expected {count} of {', '.join(choices)}")
-        return value
 
     def parsed(self, name: str, parse: Callable[[dict[str, Any]], T]) -> T:
         """What ``parse`` makes of a mapping."""

@@ -162,5 +162,5 @@ def _object_path(
 def _share_in_view(points: np.ndarray, T_world_camera: np.ndarray, camera: Intrinsics) -> float:
     q = (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
     z = np.maximum(q[:, 2], 1e-3)
-    u, v = camera.fx * q[:, 0] / z + camera.cx, camera.fy * q[:, 1] / z + camera.cy
+    u, v = camera.project(q[:, 0], q[:, 1], z)
     return float(np.mean((q[:, 2] > 0.1) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)))

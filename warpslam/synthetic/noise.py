@@ -66,7 +66,7 @@ def _pairs(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _at_grazing_angle(depth: np.ndarray, k: Intrinsics, limit: float) -> np.ndarray:
     i, j = np.meshgrid(np.arange(k.width), np.arange(k.height))
-    points = np.stack([(i - k.cx) / k.fx, (j - k.cy) / k.fy, np.ones_like(depth)], axis=-1) * depth[..., None]
+    points = k.backproject(i, j, depth)
     normals = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
     size = np.linalg.norm(normals, axis=-1) * np.linalg.norm(points, axis=-1)
     cosine = np.abs((normals * points).sum(axis=-1)) / np.maximum(size, 1e-12)
