@@ -101,6 +101,15 @@ def gauss_newton_step(
     batch.launcher.launch(gauss_newton.gauss_newton_step_of_parts, 1, [chunks, motion.normal_parts, poses])
 
 
+def note_rays(batch: RayBatch, noted: wp.array) -> None:
+    """After a loss: keep whether a ray is kept, whether it is an inlier, its measured and its rendered depth [m].
+
+    noted: Float (iterations, rays + 1, 4); the last row of an iteration holds the loss.
+    """
+    inputs = [batch.iteration, batch.keep, batch.inlier, batch.measured_depth, batch.depth, batch.loss, noted]
+    batch.launcher.launch(losses.note_rays, batch.count, inputs)
+
+
 class MotionArrays:
     """Derivatives of rays by a motion of the camera, and the normal equations."""
 

@@ -139,6 +139,13 @@ def adam_poses(
 
 
 @wp.kernel(enable_backward=False)
+def take_pose(iteration: wp.array[int], candidates: wp.array2d[float], poses: wp.array2d[float]):
+    """The first pose vector becomes the candidate of this iteration."""
+    k = wp.tid()
+    poses[0, k] = candidates[iteration[0], k]
+
+
+@wp.kernel(enable_backward=False)
 def note_pose(iteration: wp.array[int], poses: wp.array2d[float], visited: wp.array2d[float]):
     """Keep the first pose vector of an iteration."""
     k = wp.tid()
