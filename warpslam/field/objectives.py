@@ -98,7 +98,9 @@ def gauss_newton_step(
         return
     chunks = -(-batch.count // gauss_newton.CHUNK)
     batch.launcher.launch(gauss_newton.normal_parts, (chunks, 32), [residuals, motion.normal_parts])
-    batch.launcher.launch(gauss_newton.gauss_newton_step_of_parts, 1, [chunks, motion.normal_parts, poses])
+    inputs = [chunks, motion.normal_parts, motion.entries]
+    batch.launcher.launch(gauss_newton.sum_parts, gauss_newton.ENTRIES, inputs)
+    batch.launcher.launch(gauss_newton.gauss_newton_step_of_entries, 1, [motion.entries, poses])
 
 
 def note_rays(batch: RayBatch, noted: wp.array) -> None:
@@ -121,5 +123,6 @@ class MotionArrays:
         self.ray_parts = wp.zeros((ray_count, by_sample.PARTS), dtype=by_sample.Vec12, device=device)
         chunks = -(-ray_count // gauss_newton.CHUNK)
         self.normal_parts = wp.zeros((chunks, gauss_newton.ENTRIES), dtype=wp.float64, device=device)
+        self.entries = wp.zeros(gauss_newton.ENTRIES, dtype=wp.float64, device=device)
         self.normal = wp.zeros(1, dtype=gauss_newton.Mat66d, device=device)
         self.right = wp.zeros(1, dtype=gauss_newton.Vec6d, device=device)

@@ -237,25 +237,28 @@ def normal_parts(residuals: Residuals, parts: wp.array2d[wp.float64]):
 
 
 @wp.kernel
-def gauss_newton_step_of_parts(chunks: int, parts: wp.array2d[wp.float64], poses: wp.array2d[float]):
-    """`gauss_newton_step` from the sums of `normal_parts`."""
-    H = Mat66d()
-    right = Vec6d()
-    for a in range(6):
-        for b in range(a, 6):
-            total = sum_parts(chunks, parts, 6 * a - (a * (a - 1)) // 2 + b - a)
-            H[a, b] = total
-            H[b, a] = total
-        right[a] = sum_parts(chunks, parts, 21 + a)
-    step_pose(H, right, poses)
-
-
-@wp.func
-def sum_parts(chunks: int, parts: wp.array2d[wp.float64], entry: int) -> wp.float64:
+def sum_parts(chunks: int, parts: wp.array2d[wp.float64], normal: wp.array[wp.float64]):
+    """The entries from the sums of `normal_parts`, one thread each."""
+    entry = wp.tid()
     total = wp.float64(0.0)
     for chunk in range(chunks):
         total += parts[chunk, entry]
-    return total
+    normal[entry] = total
+
+
+@wp.kernel
+def gauss_newton_step_of_entries(normal: wp.array[wp.float64], poses: wp.array2d[float]):
+    """`gauss_newton_step` from the entries that `sum_parts` leaves."""
+    H = Mat66d()
+    right = Vec6d()
+    entry = int(0)
+    for a in range(6):
+        for b in range(a, 6):
+            H[a, b] = normal[entry]
+            H[b, a] = normal[entry]
+            entry += 1
+        right[a] = normal[21 + a]
+    step_pose(H, right, poses)
 
 
 @wp.func
