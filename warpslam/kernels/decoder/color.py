@@ -11,6 +11,7 @@ from warpslam.kernels.decoder.layout import (
     E0,
     E3,
     OUT_32,
+    STORED_COLUMNS,
     W1,
     WEIGHT_GROUP,
     WEIGHT_GROUP_COLUMNS,
@@ -123,9 +124,12 @@ def color_kernels(build: Build) -> dict[str, wp.Kernel]:
                         for column in range(WEIGHT_GROUP_COLUMNS):
                             weights.layer_grad[group_row + p, column] = Vec32()
             else:
+                # What an earlier iteration left there must not count again.
                 if grid.wanted != 0:
-                    # What an earlier iteration left there must not count again.
                     put_row(grid.by_sample, samples[0], 0, Vec32())
+                if weights.wanted != 0:
+                    for column in range(STORED_COLUMNS):
+                        put_row(weights.layer_grad, samples[0], column, Vec32())
             return
         rows = Indices(samples)
         if wp.static(on_cpu):
@@ -245,22 +249,22 @@ def color_kernels(build: Build) -> dict[str, wp.Kernel]:
         total = Vec32()
         for place in range(slot * share, wp.min(slot * share + share, count)):
             sample = listed.samples[listed.start + place]
-            by_color = color_grad[sample]
-            if by_color[0] != 0.0 or by_color[1] != 0.0 or by_color[2] != 0.0:
-                if target < OUT_32:
-                    factor = float(1.0)
-                    if from_activations:
-                        factor = entry(weights.activations, sample, x, lane)
-                    elif section < 15:
-                        factor = entry(weights.layer_grad, sample, x, lane)
-                    elif lane < E0:
-                        factor = sample_point(sample, rays)[lane - 3 * (lane // 3)]
-                    total = add_scaled_column(total, factor, weights.layer_grad, sample, d)
-                elif target < OUT_32 + 3:
-                    total = add_scaled_column(total, by_color[target - OUT_32], weights.activations, sample, 4)
-                else:
-                    for k in range(3):
-                        total[k] += by_color[k]
+            if target < OUT_32:
+                factor = float(1.0)
+                if from_activations:
+                    factor = entry(weights.activations, sample, x, lane)
+                elif section < 15:
+                    factor = entry(weights.layer_grad, sample, x, lane)
+                elif lane < E0:
+                    factor = sample_point(sample, rays)[lane - 3 * (lane // 3)]
+                total = add_scaled_column(total, factor, weights.layer_grad, sample, d)
+            elif target < OUT_32 + 3:
+                by_color = color_grad[sample]
+                total = add_scaled_column(total, by_color[target - OUT_32], weights.activations, sample, 4)
+            else:
+                by_color = color_grad[sample]
+                for k in range(3):
+                    total[k] += by_color[k]
         weights.rows[slot, target] = weights.rows[slot, target] + total
 
     @build.func

@@ -55,7 +55,7 @@ over a third of the samples takes as long as one over all.
 RUN = 8
 """Samples of a list whose gradients a thread of `scatter_features` adds up before it goes to memory."""
 
-WEIGHT_SLOTS = 64
+WEIGHT_SLOTS = 128
 """Buffers of the colour decoder's weight gradient on CUDA."""
 
 WEIGHT_GROUP = 16
