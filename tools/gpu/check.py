@@ -576,8 +576,10 @@ def examine(program: Any, batch: Any, repeats: int) -> Figures:
     return {**figures, "rows": rows}
 
 
-_BLOCK_SIZES = (32, 64, 128, 256)
-"""Threads of a block; the first is what launches have."""
+_BLOCK_SIZES = (32,)
+"""Threads of a block; the first is what launches have, and what the modules are compiled for: more would write behind
+the end of shared memory.
+"""
 
 
 def _is_decoder(command: Any) -> bool:
