@@ -34,8 +34,8 @@ KERNELS = {
     "list_weighty", "list_steep", "composite_backward", "collect_ray_gradients", "mapping_loss",
     "mapping_loss (adjoint)", "tracking_loss",
     "tracking_loss (adjoint)", "cast_rays (adjoint)", "tracking_residuals", "choose_inliers", "lower_median",
-    "adam_rows", "adam_poses", "advance_step", "note_pose", "transpose_color_weights", "classify_points",
-    "find_facing",
+    "adam_rows", "adam_poses", "advance_step", "note_pose", "take_pose", "note_rays",
+    "transpose_color_weights", "classify_points", "find_facing",
 }  # fmt: skip
 HOOKED = (
     (warp_context, "invoke"), (wp, "launch"), (wp.Launch, "launch"), (wp.Module, "load"), (program, "_pool"),

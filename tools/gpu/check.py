@@ -576,7 +576,7 @@ def examine(program: Any, batch: Any, repeats: int) -> Figures:
     return {**figures, "rows": rows}
 
 
-_BLOCK_SIZES = (256, 128, 64, 32)
+_BLOCK_SIZES = (32, 64, 128, 256)
 """Threads of a block; the first is what launches have."""
 
 

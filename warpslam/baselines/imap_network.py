@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import warp as wp
 
-from warpslam.field.arrays import struct
+from warpslam.field.arrays import entries, struct
 from warpslam.field.complexity import imap_shapes
 from warpslam.field.decoders import EMBEDDING_SCALE
 from warpslam.field.ray_batch import RayBatch
@@ -252,7 +252,7 @@ class ImapBatch(RayBatch):
             x = self.layers[k - 1] if k else self.embedding
             blocks = _IN_BLOCKS[k]
             if wanted.weights is not None:
-                inputs = [parts, blocks, imap.LAYER[k], _channels(x), d, wanted.weights]
+                inputs = [parts, blocks, imap.LAYER[k], entries(x), d, wanted.weights]
                 result.append((kernels.layer_weights, (chunks, imap.BLOCKS, 4 * blocks), inputs))
                 inputs = [parts, imap.BIAS + 8 * k, d, wanted.weights]
                 result.append((kernels.bias_weights, (chunks, imap.BLOCKS), inputs))
@@ -275,8 +275,3 @@ class ImapBatch(RayBatch):
 
 def _layer(in_blocks: int, W: wp.array, row: int, bias: wp.array, bias_row: int) -> imap.Layer:
     return struct(imap.Layer, trips=32, in_blocks=in_blocks, W=W, row=row, bias=bias, bias_row=bias_row)
-
-
-def _channels(x: wp.array) -> wp.array:
-    """The same memory with the 32 channels of a `Vec32` as a third axis."""
-    return wp.array(ptr=x.ptr, dtype=float, shape=(*x.shape, 32), device=x.device, copy=False)

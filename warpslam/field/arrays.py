@@ -86,9 +86,16 @@ class Gradients:
     inliers_move: bool = False
 
 
-def gradient_buffers(row_count: int, device: wp.Device) -> wp.array:
-    """Zeroed buffers (slices, row_count) of `Vec32` for the gradient of a grid or of decoder weights."""
-    return wp.zeros((slice_count(device), row_count), dtype=Vec32, device=device)
+def gradient_buffers(row_count: int, device: wp.Device, count: int | None = None) -> wp.array:
+    """Zeroed buffers (``count``, row_count) of `Vec32` for the gradient of a grid or of decoder weights; one a slice by
+    default.
+    """
+    return wp.zeros((count or slice_count(device), row_count), dtype=Vec32, device=device)
+
+
+def entries(rows: wp.array) -> wp.array:
+    """The same memory with the 32 numbers of a `Vec32` as another axis; it must not outlive ``rows``."""
+    return wp.array(ptr=rows.ptr, dtype=float, shape=(*rows.shape, 32), device=rows.device, copy=False)
 
 
 def struct(kind: Any, **fields: Any) -> Any:

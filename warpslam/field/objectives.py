@@ -10,7 +10,7 @@ import warp as wp
 from warpslam.field.arrays import EXACT, FieldArrays, Gradients, Thresholds, struct
 from warpslam.field.passes import color_adjoint, geometry_adjoint, steep_list, steep_samples
 from warpslam.field.ray_batch import RayBatch
-from warpslam.kernels import gauss_newton, losses
+from warpslam.kernels import by_sample, gauss_newton, losses
 from warpslam.runtime.launching import Step
 
 
@@ -60,18 +60,26 @@ def gauss_newton_step(
     motion, wanted = batch.motion, Gradients(points=True)
 
     def steps(first: int, stop: int, slot: int) -> list[Step]:
-        inputs = [first, steep_list(batch, first, slot), batch.rays, batch.inlier, batch.rendered]
+        inputs = [steep_list(batch, first, slot), batch.rays, batch.inlier, batch.rendered]
         inputs += [thresholds.min_weight, thresholds.min_gradient, motion.by_logit, batch.logit_grad, batch.color_grad]
-        result: list[Step] = [(gauss_newton.ray_derivatives, stop - first, inputs)]
+        samples, ray_count = batch.sample_count, stop - first
+        result: list[Step] = [(gauss_newton.ray_derivatives, ray_count, [first, *inputs])]
+        if batch.kernels.by_sample:
+            result = [(by_sample.ray_derivatives, ray_count * samples, inputs)]
         result.append(steep_samples(batch, first, stop, slot, 0.0))
         for level in ("middle", "fine"):
-            result.append(geometry_adjoint(batch, arrays, level, wanted, first, stop, slot))
-        result.append(color_adjoint(batch, arrays, wanted, first, stop, slot, motion.grey_by_point))
-        inputs = [first, batch.rays, motion.by_logit, batch.point_grad, motion.grey_by_point]
-        result.append((gauss_newton.ray_jacobians, stop - first, [*inputs, motion.depth, motion.grey]))
+            result += geometry_adjoint(batch, arrays, level, wanted, first, stop, slot)
+        result += color_adjoint(batch, arrays, wanted, first, stop, slot, motion.grey_by_point)
+        inputs = [batch.rays, motion.by_logit, batch.point_grad, motion.grey_by_point]
+        if batch.kernels.by_sample:
+            result.append((by_sample.jacobian_parts, (ray_count, by_sample.PARTS), [*inputs, motion.ray_parts]))
+            inputs = [batch.direction, motion.ray_parts, motion.depth, motion.grey]
+            result.append((by_sample.ray_jacobians, ray_count, inputs))
+        else:
+            result.append((gauss_newton.ray_jacobians, ray_count, [first, *inputs, motion.depth, motion.grey]))
         return result
 
-    batch.launcher.slices(batch.count, steps)
+    batch.launcher.slices(batch.count, steps, whole=batch.kernels.by_sample)
     residuals = struct(
         gauss_newton.Residuals,
         ray_count=batch.count,
@@ -85,7 +93,23 @@ def gauss_newton_step(
         depth_by_motion=motion.depth,
         grey_by_motion=motion.grey,
     )
-    batch.launcher.launch(gauss_newton.gauss_newton_step, 1, [residuals, motion.normal, motion.right, poses])
+    if not batch.kernels.by_sample:
+        batch.launcher.launch(gauss_newton.gauss_newton_step, 1, [residuals, motion.normal, motion.right, poses])
+        return
+    chunks = -(-batch.count // gauss_newton.CHUNK)
+    batch.launcher.launch(gauss_newton.normal_parts, (chunks, 32), [residuals, motion.normal_parts])
+    inputs = [chunks, motion.normal_parts, motion.entries]
+    batch.launcher.launch(gauss_newton.sum_parts, gauss_newton.ENTRIES, inputs)
+    batch.launcher.launch(gauss_newton.gauss_newton_step_of_entries, 1, [motion.entries, poses])
+
+
+def note_rays(batch: RayBatch, noted: wp.array) -> None:
+    """After a loss: keep whether a ray is kept, whether it is an inlier, its measured and its rendered depth [m].
+
+    noted: Float (iterations, rays + 1, 4); the last row of an iteration holds the loss.
+    """
+    inputs = [batch.iteration, batch.keep, batch.inlier, batch.measured_depth, batch.depth, batch.loss, noted]
+    batch.launcher.launch(losses.note_rays, batch.count, inputs)
 
 
 class MotionArrays:
@@ -96,5 +120,9 @@ class MotionArrays:
         self.grey_by_point = wp.zeros(point_count, dtype=wp.vec3, device=device)
         self.depth = wp.zeros(ray_count, dtype=gauss_newton.Vec6, device=device)
         self.grey = wp.zeros(ray_count, dtype=gauss_newton.Vec6, device=device)
+        self.ray_parts = wp.zeros((ray_count, by_sample.PARTS), dtype=by_sample.Vec12, device=device)
+        chunks = -(-ray_count // gauss_newton.CHUNK)
+        self.normal_parts = wp.zeros((chunks, gauss_newton.ENTRIES), dtype=wp.float64, device=device)
+        self.entries = wp.zeros(gauss_newton.ENTRIES, dtype=wp.float64, device=device)
         self.normal = wp.zeros(1, dtype=gauss_newton.Mat66d, device=device)
         self.right = wp.zeros(1, dtype=gauss_newton.Vec6d, device=device)

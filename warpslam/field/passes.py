@@ -7,11 +7,11 @@ from functools import partial
 
 import warp as wp
 
-from warpslam.field.arrays import EXACT, FieldArrays, Gradients, Thresholds, struct
+from warpslam.field.arrays import EXACT, FieldArrays, Gradients, Thresholds, entries, struct
 from warpslam.field.ray_batch import RayBatch
-from warpslam.kernels import compositing, rays
+from warpslam.kernels import by_sample, compositing, rays
 from warpslam.kernels.compositing import Listed
-from warpslam.kernels.decoder.layout import COLOR_WEIGHT_ROWS, OUT_32, OUT_64, RowGradient, WeightGradient, Weights
+from warpslam.kernels.decoder.layout import OUT_32, OUT_64, RUN, WEIGHT_SECTIONS, RowGradient, WeightGradient, Weights
 from warpslam.kernels.samples import Span
 from warpslam.runtime.launching import Step
 from warpslam.runtime.program import run_slices
@@ -24,10 +24,11 @@ def query(batch: RayBatch, arrays: FieldArrays, stage: str) -> None:
         result = [_start(batch, first, stop, slot)]
         result += _logits(batch, arrays, stage, first, stop, 0, batch.sample_count, EXACT)
         if stage == "color":
-            result += _colors(batch, arrays, first, stop, slot, 0.0)
+            result.append(_weighty_samples(batch, first, stop, slot, 0.0))
+            result.append(_color_forward(batch, arrays, first, stop, slot))
         return result
 
-    batch.launcher.slices(batch.count, steps)
+    batch.launcher.slices(batch.count, steps, whole=batch.kernels.by_sample)
 
 
 def render(
@@ -48,26 +49,19 @@ def render(
     weights = None if gradients is None else gradients.color_weights
     if weights is not None:
         batch.make_room_for_activations()
-    samples = batch.sample_count
-    width = batch.kernels.group_size if thresholds.min_transmittance > 0 else samples
+    if gradients is not None and gradients.grids:
+        batch.make_room_for_feature_gradients()
+    weigh = _weigh_by_sample if batch.kernels.by_sample else _weigh_by_ray
 
     def steps(first: int, stop: int, slot: int) -> list[Step]:
-        ray_count = stop - first
-        result = [_start(batch, first, stop, slot)]
-        for sample in range(0, samples, width):
-            group = min(width, samples - sample)
-            result += _logits(batch, arrays, stage, first, stop, sample, group, thresholds)
-            inputs = [first, sample, group, thresholds.min_transmittance, arrays.bound, batch.rays, batch.rendered]
-            result.append((compositing.composite, ray_count, [*inputs, batch.transmittance, batch.depth]))
-        inputs = [first, batch.rays, batch.keep, batch.weight, batch.depth, batch.variance]
-        result.append((compositing.ray_variance, ray_count, inputs))
+        result = [_start(batch, first, stop, slot), *weigh(batch, arrays, stage, first, stop, slot, thresholds)]
         if stage == "color":
-            result += _colors(batch, arrays, first, stop, slot, thresholds.min_weight, weights)
-            inputs = [first, samples, batch.keep, batch.color, batch.weight, batch.rgb]
-            result.append((compositing.composite_color, ray_count, inputs))
+            result.append(_color_forward(batch, arrays, first, stop, slot, weights))
+            inputs = [first, batch.sample_count, batch.keep, batch.color, batch.weight, batch.rgb]
+            result.append((compositing.composite_color, stop - first, inputs))
         return result
 
-    batch.launcher.slices(batch.count, steps)
+    batch.launcher.slices(batch.count, steps, whole=batch.kernels.by_sample)
     if gradients is not None and tape is not None:
         tape.record_func(_adjoint(batch, arrays, stage, gradients, thresholds), [batch.depth, batch.rgb])
 
@@ -91,15 +85,18 @@ def steep_list(batch: RayBatch, first: int, slot: int) -> Listed:
 
 def geometry_adjoint(
     batch: RayBatch, arrays: FieldArrays, level: str, gradients: Gradients, first: int, stop: int, slot: int
-) -> Step:
+) -> list[Step]:
     """From the gradient of the logits to that of a level's features, and of the points."""
+    listed = steep_list(batch, first, slot)
     dim = batch.kernels.thread_count((stop - first) * batch.sample_count)
-    inputs = [steep_list(batch, first, slot), batch.rays, arrays.level(level), _weights(batch, arrays, level)]
+    inputs = [listed, batch.rays, arrays.level(level), _weights(batch, arrays, level)]
+    scatter = _scatter(batch, arrays, level, gradients, listed, stop - first)
     if level == "coarse":
         inputs += [batch.logit_grad, _grid_gradient(batch, gradients, level)]
-        return (batch.kernels.coarse_backward, dim, inputs)
+        return [(batch.kernels.coarse_backward, dim, inputs), *scatter]
     inputs += [OUT_64 if level == "fine" else OUT_32, batch.logit_grad, _grid_gradient(batch, gradients, level)]
-    return (batch.kernels.geometry_backward, dim, [*inputs, int(gradients.points), batch.point_grad])
+    inputs += [int(gradients.points), batch.point_grad]
+    return [(batch.kernels.geometry_backward, dim, inputs), *scatter]
 
 
 def color_adjoint(
@@ -110,15 +107,30 @@ def color_adjoint(
     stop: int,
     slot: int,
     point_grad: wp.array,
-) -> Step:
+) -> list[Step]:
     """From the gradient of the samples' colours to that of the features, of the points, and of the weights."""
     blocks = batch.kernels.color_blocks
-    inputs = [_listed(batch, first, slot, batch.weighty, batch.weighty_count), blocks, batch.rays]
-    inputs += [arrays.level("color"), _weights(batch, arrays, "color"), batch.color_grad]
-    inputs += [_grid_gradient(batch, gradients, "color"), int(gradients.points), point_grad]
-    inputs += [_weight_gradient(batch, gradients.color_weights)]
+    listed = _listed(batch, first, slot, batch.weighty, batch.weighty_count)
+    weights = _weight_gradient(batch, gradients.color_weights)
+    inputs = [listed, blocks, batch.rays, arrays.level("color"), _weights(batch, arrays, "color"), batch.color_grad]
+    inputs += [_grid_gradient(batch, gradients, "color"), int(gradients.points), point_grad, weights]
     threads = -(-batch.kernels.thread_count((stop - first) * batch.sample_count) // blocks)
-    return (batch.kernels.color_backward, threads, inputs)
+    result: list[Step] = [(batch.kernels.color_backward, threads, inputs)]
+    result += _scatter(batch, arrays, "color", gradients, listed, stop - first)
+    if gradients.color_weights is not None and batch.kernels.by_sample:
+        dim = (gradients.color_weights.shape[0], WEIGHT_SECTIONS, 32)
+        result.append((batch.kernels.color_weights, dim, [listed, batch.rays, batch.color_grad, weights]))
+    return result
+
+
+def _scatter(
+    batch: RayBatch, arrays: FieldArrays, level: str, gradients: Gradients, listed: Listed, ray_count: int
+) -> list[Step]:
+    """Where samples store the gradients of their features: bring them to the rows of the grid."""
+    if not batch.kernels.by_sample or level not in gradients.grids:
+        return []
+    inputs = [listed, batch.rays, arrays.lattices[level], _grid_gradient(batch, gradients, level)]
+    return [(batch.kernels.scatter_features, (-(-ray_count * batch.sample_count // RUN), 32), inputs)]
 
 
 def _start(batch: RayBatch, first: int, stop: int, slot: int) -> Step:
@@ -153,23 +165,56 @@ def _logits(
     return steps
 
 
-def _colors(
-    batch: RayBatch,
-    arrays: FieldArrays,
-    first: int,
-    stop: int,
-    slot: int,
-    min_weight: float,
-    weight_gradient: wp.array | None = None,
+def _weigh_by_ray(
+    batch: RayBatch, arrays: FieldArrays, stage: str, first: int, stop: int, slot: int, thresholds: Thresholds
 ) -> list[Step]:
-    """Colour (Eq. 4) of the samples that weigh at least ``min_weight``."""
+    """Weights, depth and variance (Eq. 5-7), and the list of the samples that need colour; group by group of samples,
+    until a ray's light is spent.
+    """
+    samples, ray_count = batch.sample_count, stop - first
+    width = batch.kernels.group_size if thresholds.min_transmittance > 0 else samples
+    result: list[Step] = []
+    for sample in range(0, samples, width):
+        group = min(width, samples - sample)
+        result += _logits(batch, arrays, stage, first, stop, sample, group, thresholds)
+        inputs = [first, sample, group, thresholds.min_transmittance, arrays.bound, batch.rays, batch.rendered]
+        result.append((compositing.composite, ray_count, [*inputs, batch.transmittance, batch.depth]))
+    inputs = [first, batch.rays, batch.keep, batch.weight, batch.depth, batch.variance]
+    result.append((compositing.ray_variance, ray_count, inputs))
+    if stage == "color":
+        result.append(_weighty_samples(batch, first, stop, slot, thresholds.min_weight))
+    return result
+
+
+def _weigh_by_sample(
+    batch: RayBatch, arrays: FieldArrays, stage: str, first: int, stop: int, slot: int, thresholds: Thresholds
+) -> list[Step]:
+    """`_weigh_by_ray` with a thread a sample, all samples at once."""
     samples = batch.sample_count
-    dim = batch.kernels.thread_count((stop - first) * samples)
+    result = _logits(batch, arrays, stage, first, stop, 0, samples, thresholds)
+    min_weight = thresholds.min_weight if stage == "color" else 0.0
+    inputs = [arrays.bound, batch.rays, batch.keep, batch.rendered, min_weight]
+    result.append((by_sample.weigh_samples, (stop - first) * samples, inputs))
     listed = _listed(batch, first, slot, batch.weighty, batch.weighty_count)
-    choose = [first, listed, samples, batch.keep, batch.weight, min_weight, batch.color]
-    inputs = [listed, batch.rays, arrays.level("color"), _weights(batch, arrays, "color")]
-    inputs += [_weight_gradient(batch, weight_gradient), batch.color]
-    return [(compositing.list_weighty, stop - first, choose), (batch.kernels.color_forward, dim, inputs)]
+    inputs = [listed, batch.rays, batch.keep, batch.weight, int(stage == "color"), min_weight]
+    result.append((by_sample.sum_rays, stop - first, [*inputs, batch.depth, batch.variance]))
+    return result
+
+
+def _weighty_samples(batch: RayBatch, first: int, stop: int, slot: int, min_weight: float) -> Step:
+    """List the samples of some rays that weigh at least ``min_weight``; the others are black."""
+    listed = _listed(batch, first, slot, batch.weighty, batch.weighty_count)
+    inputs = [first, listed, batch.sample_count, batch.keep, batch.weight, min_weight, batch.color]
+    return (compositing.list_weighty, stop - first, inputs)
+
+
+def _color_forward(
+    batch: RayBatch, arrays: FieldArrays, first: int, stop: int, slot: int, weight_gradient: wp.array | None = None
+) -> Step:
+    """Colour (Eq. 4) of the samples that are listed for it."""
+    inputs = [_listed(batch, first, slot, batch.weighty, batch.weighty_count), batch.rays, arrays.level("color")]
+    inputs += [_weights(batch, arrays, "color"), _weight_gradient(batch, weight_gradient), batch.color]
+    return (batch.kernels.color_forward, batch.kernels.thread_count((stop - first) * batch.sample_count), inputs)
 
 
 def _adjoint(
@@ -178,39 +223,52 @@ def _adjoint(
     """The backward pass of `render` as a function that replays its launches."""
     want_weights = gradients.color_weights is not None
 
+    composited = _composited_backward_by_sample if batch.kernels.by_sample else _composited_backward_by_ray
+
     def steps(first: int, stop: int, slot: int) -> list[Step]:
-        inputs = [first, steep_list(batch, first, slot), batch.rays, batch.keep, batch.rendered, int(stage == "color")]
-        inputs += [thresholds.min_weight, batch.depth.grad, batch.rgb.grad, batch.logit_grad, batch.color_grad]
-        result: list[Step] = [(compositing.composite_backward, stop - first, inputs)]
-        result.append(steep_samples(batch, first, stop, slot, thresholds.min_gradient))
+        result = composited(batch, stage, first, stop, slot, thresholds)
         levels = {"coarse": ("coarse",), "middle": ("middle",)}.get(stage, ("middle", "fine"))
         for level in levels:
             if gradients.points or level in gradients.grids:
-                result.append(geometry_adjoint(batch, arrays, level, gradients, first, stop, slot))
+                result += geometry_adjoint(batch, arrays, level, gradients, first, stop, slot)
         if stage == "color" and (gradients.points or want_weights or "color" in gradients.grids):
-            result.append(color_adjoint(batch, arrays, gradients, first, stop, slot, batch.point_grad))
+            result += color_adjoint(batch, arrays, gradients, first, stop, slot, batch.point_grad)
         if gradients.points:
             counts = batch.inlier if gradients.inliers_move else batch.keep
-            inputs = [first, batch.rays, batch.keep, counts, batch.point_grad]
-            inputs += [batch.origin.grad, batch.direction.grad]
-            result.append((rays.collect_ray_gradients, stop - first, inputs))
+            inputs = [batch.rays, batch.keep, counts, batch.point_grad, batch.origin.grad, batch.direction.grad]
+            if batch.kernels.by_sample:
+                dim = (stop - first, by_sample.PARTS)
+                result.append((by_sample.collect_ray_gradients, dim, inputs))
+            else:
+                result.append((rays.collect_ray_gradients, stop - first, [first, *inputs]))
         return result
 
-    commands = batch.launcher.slice_commands(batch.count, steps)
-    last: list[wp.Launch] = []
-    if want_weights and stage == "color" and batch.kernels.sums_weights_apart:
-        chunk, points = 256, batch.count * batch.sample_count
-        inputs = [points, chunk, batch.rays, _weights(batch, arrays, "color"), batch.color_grad]
-        inputs.append(_weight_gradient(batch, gradients.color_weights))
-        dim = (-(-points // chunk), COLOR_WEIGHT_ROWS)
-        last.append(batch.launcher.command(batch.kernels.color_weights, dim, inputs))
+    commands = batch.launcher.slice_commands(batch.count, steps, whole=batch.kernels.by_sample)
+    return partial(run_slices, commands)
 
-    def run() -> None:
-        run_slices(commands)
-        for command in last:
-            command.launch()
 
-    return run
+def _composited_backward_by_ray(
+    batch: RayBatch, stage: str, first: int, stop: int, slot: int, thresholds: Thresholds
+) -> list[Step]:
+    """Adjoint of compositing, and the list of the samples whose logit has a gradient."""
+    inputs = [first, steep_list(batch, first, slot), batch.rays, batch.keep, batch.rendered, int(stage == "color")]
+    inputs += [thresholds.min_weight, batch.depth.grad, batch.rgb.grad, batch.logit_grad, batch.color_grad]
+    steep = steep_samples(batch, first, stop, slot, thresholds.min_gradient)
+    return [(compositing.composite_backward, stop - first, inputs), steep]
+
+
+def _composited_backward_by_sample(
+    batch: RayBatch, stage: str, first: int, stop: int, slot: int, thresholds: Thresholds
+) -> list[Step]:
+    """`_composited_backward_by_ray` with a thread a sample."""
+    listed = steep_list(batch, first, slot)
+    inputs = [listed, batch.rays, batch.keep, batch.rendered, int(stage == "color"), thresholds.min_weight]
+    inputs += [batch.depth.grad, batch.rgb.grad, batch.logit_grad, batch.color_grad]
+    steep = [listed, batch.sample_count, batch.logit_grad, thresholds.min_gradient, batch.depth.grad, batch.rgb.grad]
+    return [
+        (by_sample.composite_backward, (stop - first) * batch.sample_count, inputs),
+        (by_sample.list_steep, stop - first, steep),
+    ]
 
 
 def _listed(batch: RayBatch, first: int, slot: int, samples: wp.array, counts: wp.array) -> Listed:
@@ -224,9 +282,16 @@ def _weights(batch: RayBatch, arrays: FieldArrays, level: str) -> Weights:
 
 def _grid_gradient(batch: RayBatch, gradients: Gradients, level: str) -> RowGradient:
     wanted = gradients.grids.get(level)
-    if wanted is None:
-        return struct(RowGradient, wanted=0, selected=batch.no_selection, rows=batch.no_rows)
-    return struct(RowGradient, wanted=1, selected=wanted.selected, rows=wanted.buffers)
+    rows = batch.no_rows if wanted is None else wanted.buffers
+    return struct(
+        RowGradient,
+        wanted=int(wanted is not None),
+        selected=batch.no_selection if wanted is None else wanted.selected,
+        rows=rows,
+        by_sample=batch.feature_grad,
+        entries=entries(rows),
+        entries_by_sample=entries(batch.feature_grad[:, 0]),
+    )
 
 
 def _weight_gradient(batch: RayBatch, rows: wp.array | None) -> WeightGradient:

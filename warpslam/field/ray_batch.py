@@ -24,7 +24,7 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.field.arrays import FieldArrays, camera_struct, projection, struct
-from warpslam.kernels import adam, compositing, pixels, rays, rejection, samples
+from warpslam.kernels import adam, by_sample, compositing, pixels, rays, rejection, samples
 from warpslam.kernels.compositing import Rendered
 from warpslam.kernels.decoder import layout
 from warpslam.kernels.decoder.build import decoders_for
@@ -92,17 +92,23 @@ class RayBatch:
         empty = wp.zeros((1, 1), dtype=Vec32, device=device)
         self.no_errors = wp.zeros((1, 1), dtype=float, device=device)
         self.no_rows, self.no_selection = empty, wp.zeros(1, dtype=wp.uint8, device=device)
-        self.activations = self.layer_grad = empty
+        self.activations = self.layer_grad = self.feature_grad = empty
         self.layer_inputs = wp.zeros((1, 1, 1), dtype=float, device=device)
         self.motion: MotionArrays | None = None
+
+    def make_room_for_feature_gradients(self) -> None:
+        """Before the first gradient of a grid is wanted, where the samples store theirs."""
+        size = self.capacity * self.max_samples
+        if self.kernels.by_sample and self.feature_grad.shape[0] < size:
+            self.feature_grad = wp.empty((size, 1), dtype=Vec32, device=self.device)
 
     def make_room_for_activations(self) -> None:
         """Before the first gradient of the colour decoder's weights is wanted."""
         size = self.capacity * self.max_samples
         if self.activations.shape[0] < size:
             self.activations = wp.empty((size, 5), dtype=Vec32, device=self.device)
-            if self.kernels.sums_weights_apart:
-                self.layer_grad = wp.empty((size, 14), dtype=Vec32, device=self.device)
+            if self.kernels.by_sample:
+                self.layer_grad = wp.empty((size, layout.STORED_COLUMNS), dtype=Vec32, device=self.device)
             else:
                 shape = (layout.WEIGHT_GROUP * slice_count(self.device), layout.WEIGHT_GROUP_COLUMNS)
                 self.layer_inputs = wp.zeros((*shape, 32), dtype=float, device=self.device)
@@ -238,6 +244,9 @@ class RayBatch:
         numbers = {"stratified": stratified, "surface": surface, "jitter": int(jitter), "use_depth": int(use_depth)}
         inputs = [self.draws, struct(Placement, **numbers), self.measured_depth, self.t_exit, self.keep]
         inputs += [self.max_depth, self.z]
+        if self.kernels.by_sample:
+            self.launcher.launch(by_sample.place_samples, self.count * self.sample_count, inputs)
+            return
 
         def steps(first: int, stop: int, slot: int) -> list[Step]:
             return [(samples.place_samples, stop - first, [first, *inputs])]

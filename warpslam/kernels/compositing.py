@@ -22,6 +22,8 @@ import warp as wp
 
 from warpslam.kernels.samples import Rays
 
+wp.set_module_options({"block_dim": 32})
+
 OUTSIDE_LOGIT = wp.constant(100.0)
 # Slices run side by side: each has a cache line of its own.
 COUNT_STRIDE = wp.constant(16)
@@ -74,6 +76,20 @@ def listed_count(listed: Listed) -> int:
 @wp.func
 def occupancy(logit: float) -> float:
     return 1.0 / (1.0 + wp.exp(-10.0 * logit))
+
+
+@wp.func
+def logit_gradient(logit: float, g: float, w: float, behind: float) -> float:
+    """d_logit of a sample with weight w, where ``behind`` is the sum of g_k w_k behind it."""
+    gradient = float(0.0)
+    # 100 marks a sample outside the bound: opaque, and constant.
+    if logit != OUTSIDE_LOGIT:
+        alpha = occupancy(logit)
+        free = 1.0 - alpha
+        # g_i T_i = g_i w_i / alpha_i; alpha > 0 unless the exponential overflowed, and then w and the gradient are 0.
+        if alpha > 0.0:
+            gradient = 10.0 * free * (g * w - alpha * behind / (free + 1.0e-10))
+    return gradient
 
 
 @wp.kernel(enable_backward=False)
@@ -286,14 +302,7 @@ def composite_backward(
             if with_color != 0:
                 g += wp.dot(d_rgb, rendered.color[i])
                 color_grad[i] = wp.where(w < min_weight, wp.vec3(), w * d_rgb)
-            # 100 marks a sample outside the bound: opaque, and constant.
-            if rendered.logit[i] != OUTSIDE_LOGIT:
-                alpha = occupancy(rendered.logit[i])
-                free = 1.0 - alpha
-                # g_i T_i = g_i w_i / alpha_i; alpha > 0 unless the exponential overflowed, and then w and the
-                # gradient are 0.
-                if alpha > 0.0:
-                    gradient = 10.0 * free * (g * w - alpha * behind / (free + 1.0e-10))
+            gradient = logit_gradient(rendered.logit[i], g, w, behind)
             behind += g * w
         else:
             if with_color != 0:

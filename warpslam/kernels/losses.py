@@ -11,6 +11,8 @@ have no gradient.
 
 import warp as wp
 
+wp.set_module_options({"block_dim": 32})
+
 
 @wp.func
 def l1(a: wp.vec3, b: wp.vec3) -> float:
@@ -66,14 +68,26 @@ def tracking_residuals(
 
 
 @wp.func
+def ranks_before(other: float, n: int, r: float, index: int) -> int:
+    """1 if residual n comes before that of ``index``; every one has a rank of its own: equal ones go by index."""
+    return wp.where(other >= 0.0 and (other < r or (other == r and n < index)), 1, 0)
+
+
+@wp.func
 def rank_of(residual: wp.array[float], index: int) -> int:
     r = residual[index]
     rank = int(0)
-    for n in range(residual.shape[0]):
-        other = residual[n]
-        # Every residual gets a rank of its own: equal values are ranked by index.
-        if other >= 0.0 and (other < r or (other == r and n < index)):
-            rank += 1
+    whole = residual.shape[0] // 4
+    # Four at a time, so that a thread waits for four loads at once.
+    for m in range(whole):
+        a = residual[4 * m]
+        b = residual[4 * m + 1]
+        c = residual[4 * m + 2]
+        d = residual[4 * m + 3]
+        rank += ranks_before(a, 4 * m, r, index) + ranks_before(b, 4 * m + 1, r, index)
+        rank += ranks_before(c, 4 * m + 2, r, index) + ranks_before(d, 4 * m + 3, r, index)
+    for n in range(4 * whole, residual.shape[0]):
+        rank += ranks_before(residual[n], n, r, index)
     return rank
 
 
@@ -124,3 +138,24 @@ def tracking_loss(
         if color_weight > 0.0:
             value += color_weight * l1(measured_rgb[tid], rgb[tid])
         wp.atomic_add(loss, 0, value)
+
+
+@wp.kernel(enable_backward=False)
+def note_rays(
+    iteration: wp.array[int],
+    keep: wp.array[int],
+    inlier: wp.array[int],
+    measured_depth: wp.array[float],
+    depth: wp.array[float],
+    loss: wp.array[float],
+    noted: wp.array3d[float],
+):
+    """Keep what the rays of an iteration came to, one row a ray, and the loss in the row behind them."""
+    tid = wp.tid()
+    n = iteration[0]
+    noted[n, tid, 0] = float(keep[tid])
+    noted[n, tid, 1] = float(inlier[tid])
+    noted[n, tid, 2] = measured_depth[tid]
+    noted[n, tid, 3] = depth[tid]
+    if tid == 0:
+        noted[n, noted.shape[1] - 1, 0] = loss[0]

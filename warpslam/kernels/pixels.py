@@ -11,7 +11,7 @@ import warp as wp
 MODULE = "warpslam.rays"
 """Pixels, rays, samples and what rejects rays compile as one Warp module."""
 
-wp.get_module(MODULE).options.update({"max_unroll": 16})
+wp.get_module(MODULE).options.update({"max_unroll": 16, "block_dim": 32})
 
 
 @wp.struct

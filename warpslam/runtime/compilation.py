@@ -24,6 +24,7 @@ _STAGES = (
     "kernels.gauss_newton",
     "kernels.adam",
     "kernels.compositing",
+    "kernels.by_sample",
     "kernels.losses",
     "kernels.grid",
     "views",

@@ -84,23 +84,29 @@ class Launcher:
             outputs,
             *gradients,
             device=self.device,
+            block_dim=kernel.module.options["block_dim"],
             adjoint=True,
             record_cmd=True,
             record_tape=False,
         )
         self._tape.record_func(adjoint.launch, [array for array in outputs if array.requires_grad])
 
-    def slices(self, count: int, steps: Callable[[int, int, int], list[Step]]) -> None:
-        """Launches that work on rays (or rows) apart: ``steps(first, stop, slot)`` for each slice of ``count``."""
-        commands = self.slice_commands(count, steps)
+    def slices(self, count: int, steps: Callable[[int, int, int], list[Step]], *, whole: bool = False) -> None:
+        """Launches that work on rays (or rows) apart: ``steps(first, stop, slot)`` for each slice of ``count``.
+
+        whole: One slice has all.
+        """
+        commands = self.slice_commands(count, steps, whole=whole)
         run_slices(commands)
         if self._program is not None:
             self._program.add_slices(commands)
 
-    def slice_commands(self, count: int, steps: Callable[[int, int, int], list[Step]]) -> list[list[wp.Launch]]:
+    def slice_commands(
+        self, count: int, steps: Callable[[int, int, int], list[Step]], *, whole: bool = False
+    ) -> list[list[wp.Launch]]:
         """The commands of `slices` without running them."""
         number = slice_count(self.device)
-        bounds = [count * n // number for n in range(number + 1)]
+        bounds = [0, *[count] * number] if whole else [count * n // number for n in range(number + 1)]
         return [
             [self.command(*step) for step in steps(first, stop, slot)] if stop > first else []
             for slot, (first, stop) in enumerate(zip(bounds[:-1], bounds[1:], strict=True))
@@ -114,7 +120,16 @@ class Launcher:
 
     def command(self, kernel: wp.Kernel, dim: Any, inputs: list) -> wp.Launch:
         """A launch that has not happened yet."""
-        return wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True, record_tape=False)
+        # On CUDA the block size is part of a module: with another one it would be compiled once more.
+        return wp.launch(
+            kernel,
+            dim=dim,
+            inputs=inputs,
+            device=self.device,
+            block_dim=kernel.module.options["block_dim"],
+            record_cmd=True,
+            record_tape=False,
+        )
 
 
 def _same(a: tuple, b: tuple) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from warpslam.field.arrays import GridGradient, gradient_buffers
+from warpslam.field.arrays import GridGradient, entries, gradient_buffers
 from warpslam.field.packing import PackedDecoder
 from warpslam.kernels import adam
 from warpslam.kernels.decoder.build import decoders_for
@@ -22,13 +22,14 @@ class RowOptimizer:
         self.launcher, self.device = launcher, launcher.device
         self.size = 0
         self.step = wp.zeros(1, dtype=int, device=self.device)
+        self._buffers: int | None = None
         self._rejected = wp.zeros(1, dtype=int, device=self.device)
 
     def start(self, size: int, rows: np.ndarray) -> None:
         """Begin a call: ``rows`` (int) of ``size`` change, with moments and step count at zero."""
         if size != self.size:
             self.size = size
-            self.gradient = gradient_buffers(size, self.device)
+            self.gradient = gradient_buffers(size, self.device, self._buffers)
             self.m = wp.zeros(size, dtype=Vec32, device=self.device)
             self.v = wp.zeros(size, dtype=Vec32, device=self.device)
         self.rows = wp.array(rows.astype(np.int32), dtype=int, device=self.device)
@@ -43,6 +44,11 @@ class RowOptimizer:
         if count == 0:
             return
         self.launcher.launch(adam.advance_step, 1, [self.step])
+        if decoders_for(self.device).by_sample:
+            inputs = [self.rows, self.step, learning_rate]
+            inputs += [entries(array) for array in (x, self.gradient, self.m, self.v)]
+            self.launcher.launch(adam.adam_entries, (count, 32), [*inputs, self._rejected])
+            return
         inputs = [self.rows, self.step, learning_rate, x, self.gradient, self.m, self.v, self._rejected]
 
         def steps(first: int, stop: int, slot: int) -> list[Step]:
@@ -74,14 +80,18 @@ class ColorDecoderOptimizer(RowOptimizer):
 
     def begin(self) -> None:
         """Start a call: all rows change."""
+        self._buffers = decoders_for(self.device).weight_slots
         self.start(COLOR_WEIGHT_ROWS, np.arange(COLOR_WEIGHT_ROWS))
 
     def update_decoder(self, packed: PackedDecoder, learning_rate: float) -> None:
         """One step on the packed weights."""
         self.update(packed.weights, learning_rate)
-        transposed = packed.transposed
-        kernel = decoders_for(self.device).transpose_color_weights
-        self.launcher.launch(kernel, transposed.shape[0], [packed.weights, transposed])
+        weights, transposed, kernels = packed.weights, packed.transposed, decoders_for(self.device)
+        if kernels.by_sample:
+            dim = (transposed.shape[0], 32)
+            self.launcher.launch(kernels.transpose_color_entries, dim, [entries(weights), entries(transposed)])
+        else:
+            self.launcher.launch(kernels.transpose_color_weights, transposed.shape[0], [weights, transposed])
 
 
 class PoseOptimizer:

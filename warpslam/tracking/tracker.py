@@ -11,7 +11,7 @@ import warp as wp
 from warpslam.camera import Intrinsics
 from warpslam.config import SamplingConfig, TrackingConfig
 from warpslam.field.arrays import FieldArrays, Gradients, Thresholds
-from warpslam.field.objectives import choose_inliers, gauss_newton_step, tracking_loss
+from warpslam.field.objectives import choose_inliers, gauss_newton_step, note_rays, tracking_loss
 from warpslam.field.passes import render
 from warpslam.field.ray_batch import RayBatch
 from warpslam.field.seeds import ray_seed
@@ -21,6 +21,7 @@ from warpslam.runtime.launching import Launcher
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.optimizers import PoseOptimizer
 
+MAX_CANDIDATES = 3
 MIN_SEEN_SHARE = 0.2
 """Where less of a frame's depth lies in what the map has seen, the share of inliers goes down as if this much did."""
 
@@ -55,6 +56,8 @@ class Tracker:
         self._poses = PoseOptimizer(1, self._launcher)
         self._window = wp.zeros(1, dtype=int, device=device)
         self._visited = wp.zeros((1, 7), dtype=float, device=device)
+        self._candidates = wp.zeros((MAX_CANDIDATES, 7), dtype=float, device=device)
+        self._judged = wp.zeros((MAX_CANDIDATES, config.pixels + 1, 4), dtype=float, device=device)
         self._thresholds = Thresholds(sampling.min_weight, sampling.min_gradient, sampling.min_transmittance)
 
     def track(
@@ -79,8 +82,7 @@ class Tracker:
             # Different pixels give different losses; only a comparison on the same ones means something.
             candidates += [start, visited[len(visited) // 2 :].mean(axis=0)]
         candidates = [vector for vector in candidates if np.isfinite(vector).all()] or [start]
-        results = [self._judge(batch, arrays, images, frame, vector) for vector in candidates]
-        return min(results, key=lambda result: result.loss)
+        return min(self._judge(batch, arrays, images, frame, candidates), key=lambda result: result.loss)
 
     def _optimize(
         self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, frame: int, start: np.ndarray, iterations: int
@@ -134,33 +136,25 @@ class Tracker:
         return float(explained.sum() / max(usable.sum(), 1))
 
     def _judge(
-        self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, frame: int, vector: np.ndarray
-    ) -> TrackingResult:
-        self._poses.begin(vector[None])
-        batch.set_seeds([self._ray_seed(frame, -1)])
+        self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, frame: int, vectors: list[np.ndarray]
+    ) -> list[TrackingResult]:
+        """What pose vectors come to, all on the same pixels; nothing comes back from the device before the last."""
+        self._candidates[: len(vectors)].assign(np.asarray(vectors, np.float32))
+        if self._judged.shape[1] != batch.capacity + 1:
+            self._judged = wp.zeros((MAX_CANDIDATES, batch.capacity + 1, 4), dtype=float, device=self.device)
+        batch.set_seeds([self._ray_seed(frame, -1)] * len(vectors))
 
         def judge() -> None:
+            self._launcher.launch(adam.take_pose, 7, [batch.iteration, self._candidates, self._poses.poses])
             self._render(batch, arrays, images)
             tracking_loss(batch, self.config.color_weight)
+            note_rays(batch, self._judged)
+            batch.next_iteration()
 
-        uses = (self.config.color_weight, *self._uses(batch, arrays), *images.arrays)
-        self._launcher.iterate("judge", uses, judge)
-        count = batch.count
-        inlier = batch.inlier.numpy()[:count] != 0
-        measured = batch.measured_depth.numpy()[:count]
-        has_depth = measured > 0
-        depth_count = max(int(has_depth.sum()), 1)
-        counting = max(int((has_depth & (batch.keep.numpy()[:count] != 0)).sum()), MIN_SEEN_SHARE * depth_count)
-        inlier_count = int(inlier.sum())
-        error = np.abs(measured - batch.depth.numpy()[:count])[inlier]
-        loss = float(batch.loss.numpy()[0]) / inlier_count if inlier_count else np.inf
-        return TrackingResult(
-            T_world_camera=pose_from_vector(vector),
-            loss=loss if np.isfinite(loss) else np.inf,
-            depth_error=float(error.mean()) if inlier_count else np.inf,
-            inliers=inlier_count / counting,
-            agreeing=inlier_count / depth_count,
-        )
+        uses = (self.config.color_weight, self._judged, *self._uses(batch, arrays), *images.arrays)
+        for _ in vectors:
+            self._launcher.iterate("judge", uses, judge)
+        return [_result(*pair) for pair in zip(vectors, self._judged.numpy(), strict=False)]
 
     def _render(self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, tape: wp.Tape | None = None) -> None:
         config, sampling = self.config, self.sampling
@@ -187,3 +181,21 @@ class Tracker:
     def _new_batch(self, pixels: int) -> RayBatch:
         samples = self.sampling.stratified + self.sampling.surface
         return RayBatch(pixels, samples, self.device, self._launcher)
+
+
+def _result(vector: np.ndarray, judged: np.ndarray) -> TrackingResult:
+    """Outcome for a pose vector from what `note_rays` kept of its rays, (rays + 1, 4)."""
+    keep, inlier, measured, depth = judged[:-1].T
+    has_depth = measured > 0
+    depth_count = max(int(has_depth.sum()), 1)
+    counting = max(int((has_depth & (keep != 0)).sum()), MIN_SEEN_SHARE * depth_count)
+    inlier_count = int((inlier != 0).sum())
+    error = np.abs(measured - depth)[inlier != 0]
+    loss = float(judged[-1, 0]) / inlier_count if inlier_count else np.inf
+    return TrackingResult(
+        T_world_camera=pose_from_vector(vector),
+        loss=loss if np.isfinite(loss) else np.inf,
+        depth_error=float(error.mean()) if inlier_count else np.inf,
+        inliers=inlier_count / counting,
+        agreeing=inlier_count / depth_count,
+    )

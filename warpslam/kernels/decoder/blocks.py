@@ -12,14 +12,18 @@ import warp as wp
 from warpslam.kernels.compositing import Listed
 from warpslam.kernels.decoder.embedding import angles, sine_cosine
 from warpslam.kernels.decoder.layout import BLOCK_SIZE, E0_T, E3_T, B, RowGradient, Weights
+from warpslam.kernels.decoder.native import add_scaled, dot_row, native_matvec, put_row
 from warpslam.kernels.grid import (
+    Cell,
     Level,
     Vec32,
+    corner_weight,
     dot32,
     find_cell,
     interpolate,
     interpolate_adjoint_features,
     interpolate_adjoint_point,
+    row_of,
     sum32,
 )
 from warpslam.kernels.samples import Rays, Span, sample_index, sample_point
@@ -49,7 +53,7 @@ class Build(SimpleNamespace):
         )
         # Without contraction, clang does not fuse a product and a sum of vectors into one instruction.
         flags = f"{wp.config.cpu_compiler_flags or ''} -ffp-contract=fast"
-        options = {"enable_backward": False, "max_unroll": 4, "cpu_compiler_flags": flags}
+        options = {"enable_backward": False, "max_unroll": 4, "cpu_compiler_flags": flags, "block_dim": 32}
         wp.get_module(self.module).options.update(options)
         block_functions(self)
         sample_functions(self)
@@ -153,7 +157,10 @@ def block_functions(build: Build) -> None:
     def store_rows(rows: wp.array2d[Vec32], samples: Indices, column: int, a: Block, wanted: int):
         if wanted != 0:
             for p in range(size):
-                rows[samples[p], column] = a[p]
+                if wp.static(on_cpu):
+                    rows[samples[p], column] = a[p]
+                else:
+                    put_row(rows, samples[p], column, a[p])
 
     @func
     def load_rows(rows: wp.array2d[Vec32], samples: Indices, column: int) -> Block:
@@ -185,41 +192,6 @@ def block_functions(build: Build) -> None:
             for i in range(32):
                 r[p, i] = d[p, i] * sine_cosine(a[i])[1]
         return r
-
-
-MATVEC = """
-    // Four rows a trip, 16 bytes a load: with loads of one number the kernels wait for the loads.
-    struct alignas(16) quad { float a, b, c, d; };
-    wp::mat_t<1, 32, wp::float32> s = r;
-    const quad* w = (const quad*)(W.data + row);
-    #pragma unroll 1
-    for (int k = 0; k < 32; k += 4) {
-        #pragma unroll
-        for (int n = 0; n < 4; ++n) {
-            const wp::float32 x_n = x.data[0][k + n];
-            #pragma unroll
-            for (int i = 0; i < 8; ++i) {
-                const quad q = w[8 * n + i];
-                s.data[0][4 * i] += x_n * q.a;
-                s.data[0][4 * i + 1] += x_n * q.b;
-                s.data[0][4 * i + 2] += x_n * q.c;
-                s.data[0][4 * i + 3] += x_n * q.d;
-            }
-        }
-        w += 32;
-    }
-    return s;
-"""
-
-
-def native_matvec(Block: type) -> Any:
-    """r + x W[row:] of one sample, as CUDA wants it."""
-
-    # Warp takes the type of the result from a decorator that is spelt like this.
-    @wp.func_native(MATVEC)
-    def matvec(r: Block, x: Block, W: wp.array[Vec32], row: int) -> Block: ...
-
-    return matvec
 
 
 def sample_functions(build: Build) -> None:
@@ -287,16 +259,31 @@ def sample_functions(build: Build) -> None:
         c = Block()
         for p in range(size):
             x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
-            c[p] += interpolate(level, find_cell(level.lattice, x))
+            if wp.static(on_cpu):
+                c[p] += interpolate(level, find_cell(level.lattice, x))
+            else:
+                c[p] += interpolate_quads(level, find_cell(level.lattice, x))
         return c
 
     @func
-    def add_to_grid(gradient: RowGradient, slot: int, level: Level, positions: Positions, wanted: Indices, dc: Block):
+    def add_to_grid(
+        gradient: RowGradient,
+        slot: int,
+        level: Level,
+        samples: Indices,
+        positions: Positions,
+        wanted: Indices,
+        dc: Block,
+    ):
+        """On CUDA `scatter_features` does it: here a warp would add to 32 rows at a time."""
         for p in range(size):
             if wanted[p] != 0:
-                x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
-                cell = find_cell(level.lattice, x)
-                interpolate_adjoint_features(gradient.rows, slot, gradient.selected, level.lattice, cell, dc[p])
+                if wp.static(on_cpu):
+                    x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
+                    cell = find_cell(level.lattice, x)
+                    interpolate_adjoint_features(gradient.rows, slot, gradient.selected, level.lattice, cell, dc[p])
+                else:
+                    put_row(gradient.by_sample, samples[p], 0, dc[p])
 
     @func
     def add_to_points(
@@ -314,7 +301,10 @@ def sample_functions(build: Build) -> None:
         d = Positions()
         for p in range(size):
             x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
-            d[p] = interpolate_adjoint_point(level, find_cell(level.lattice, x), dc[p])
+            if wp.static(on_cpu):
+                d[p] = interpolate_adjoint_point(level, find_cell(level.lattice, x), dc[p])
+            else:
+                d[p] = interpolate_adjoint_point_quads(level, find_cell(level.lattice, x), dc[p])
         # Sums over the channels are slow on the CPU: there the chunks are added first. On CUDA registers are scarce.
         along_x = Block()
         along_y = Block()
@@ -338,3 +328,36 @@ def sample_functions(build: Build) -> None:
                 d[p] += wp.vec3(sum32(along_x[p]), sum32(along_y[p]), sum32(along_z[p]))
             if wanted[p] != 0:
                 point_grad[samples[p]] = point_grad[samples[p]] + wp.vec3(d[p, 0], d[p, 1], d[p, 2])
+
+
+@wp.func
+def interpolate_quads(level: Level, cell: Cell) -> Vec32:
+    """`interpolate` for CUDA."""
+    c = Vec32()
+    for di in range(2):
+        for dj in range(2):
+            for dk in range(2):
+                row = row_of(level.lattice, cell.corner[0] + di, cell.corner[1] + dj, cell.corner[2] + dk)
+                c = add_scaled(c, corner_weight(cell.offset, di, dj, dk), level.features, row)
+    return c
+
+
+@wp.func
+def interpolate_adjoint_point_quads(level: Level, cell: Cell, dc: Vec32) -> wp.vec3:
+    """`interpolate_adjoint_point` for CUDA, where a product a corner takes fewer registers than a vector an axis."""
+    f = cell.offset
+    du = wp.vec3()
+    for di in range(2):
+        for dj in range(2):
+            for dk in range(2):
+                row = row_of(level.lattice, cell.corner[0] + di, cell.corner[1] + dj, cell.corner[2] + dk)
+                s = dot_row(dc, level.features, row)
+                wx = wp.where(di == 1, f[0], 1.0 - f[0])
+                wy = wp.where(dj == 1, f[1], 1.0 - f[1])
+                wz = wp.where(dk == 1, f[2], 1.0 - f[2])
+                du += s * wp.vec3(
+                    wp.where(di == 1, wy * wz, -wy * wz),
+                    wp.where(dj == 1, wx * wz, -wx * wz),
+                    wp.where(dk == 1, wx * wy, -wx * wy),
+                )
+    return wp.cw_mul(wp.cw_mul(du, cell.free), level.lattice.inverse_spacing)

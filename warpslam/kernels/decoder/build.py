@@ -8,7 +8,8 @@ from warpslam.kernels.decoder.blocks import Build
 from warpslam.kernels.decoder.coarse import coarse_kernels
 from warpslam.kernels.decoder.color import color_kernels
 from warpslam.kernels.decoder.geometry import geometry_kernels
-from warpslam.kernels.decoder.layout import GROUP_SIZE, WEIGHT_GROUP
+from warpslam.kernels.decoder.layout import GROUP_SIZE, WEIGHT_GROUP, WEIGHT_SLOTS
+from warpslam.kernels.decoder.scatter import scatter_kernels
 
 
 def decoder_kernels(target: str) -> SimpleNamespace:
@@ -18,18 +19,23 @@ def decoder_kernels(target: str) -> SimpleNamespace:
     samples has as many.
     """
     build = Build(target)
+    more = {} if build.on_cpu else scatter_kernels(build)
     return SimpleNamespace(
         **geometry_kernels(build),
         **color_kernels(build),
         **coarse_kernels(build),
+        **more,
         # Samples of a ray between two looks at its transmittance.
         group_size=GROUP_SIZE[target],
         # Blocks of a thread of `color_backward`.
         color_blocks=WEIGHT_GROUP // build.size if build.on_cpu else 1,
         # Threads of a launch over so many samples, one block each.
         thread_count=lambda point_count: -(-point_count // build.size),
-        # Whether `color_backward` leaves the sum of the weight gradient to `color_weights`.
-        sums_weights_apart=not build.on_cpu,
+        # Whether a sample has a thread of its own: the adjoints leave the sums to `scatter_features` and
+        # `color_weights`, and compositing to `warpslam.kernels.by_sample`.
+        by_sample=not build.on_cpu,
+        # Buffers of the colour decoder's weight gradient; None: one a slice.
+        weight_slots=None if build.on_cpu else WEIGHT_SLOTS,
     )
 
 

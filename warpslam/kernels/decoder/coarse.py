@@ -76,6 +76,6 @@ def coarse_kernels(build: Build) -> dict[str, wp.Kernel]:
         a = keep_active(matvec(Block(), a, decoder.T, C_W2), decoder.bits, samples, 1)
         a = keep_active(matvec(Block(), a, decoder.T, C_W1), decoder.bits, samples, 0)
         dc = matvec(dc, a, decoder.T, C_W0)
-        add_to_grid(grid, listed.slot, level, positions_of(samples, rays), wanted, dc)
+        add_to_grid(grid, listed.slot, level, samples, positions_of(samples, rays), wanted, dc)
 
     return {kernel.key: kernel for kernel in (coarse_forward, coarse_backward)}

@@ -4,13 +4,14 @@ import warp as wp
 
 from warpslam.kernels.compositing import Listed, listed_count
 from warpslam.kernels.decoder.blocks import Build
-from warpslam.kernels.decoder.embedding import angles, sine_cosine
 from warpslam.kernels.decoder.layers import backward_layers, forward_layers
 from warpslam.kernels.decoder.layout import (
     BIAS,
+    COLOR_WEIGHT_ROWS,
     E0,
     E3,
     OUT_32,
+    STORED_COLUMNS,
     W1,
     WEIGHT_GROUP,
     WEIGHT_GROUP_COLUMNS,
@@ -20,6 +21,7 @@ from warpslam.kernels.decoder.layout import (
     WeightGradient,
     Weights,
 )
+from warpslam.kernels.decoder.native import add_scaled_column, entry, put_row
 from warpslam.kernels.grid import Level, Vec32
 from warpslam.kernels.samples import Rays, sample_point
 
@@ -121,6 +123,13 @@ def color_kernels(build: Build) -> dict[str, wp.Kernel]:
                     for p in range(size):
                         for column in range(WEIGHT_GROUP_COLUMNS):
                             weights.layer_grad[group_row + p, column] = Vec32()
+            else:
+                # What an earlier iteration left there must not count again.
+                if grid.wanted != 0:
+                    put_row(grid.by_sample, samples[0], 0, Vec32())
+                if weights.wanted != 0:
+                    for column in range(STORED_COLUMNS):
+                        put_row(weights.layer_grad, samples[0], column, Vec32())
             return
         rows = Indices(samples)
         if wp.static(on_cpu):
@@ -131,7 +140,7 @@ def color_kernels(build: Build) -> dict[str, wp.Kernel]:
         dc, a0, a3 = layers_backward(g4, decoder, samples, slot, rows, weights)
         positions = positions_of(samples, rays)
         if grid.wanted != 0:
-            add_to_grid(grid, slot, level, positions, wanted, dc)
+            add_to_grid(grid, slot, level, samples, positions, wanted, dc)
         if want_point != 0:
             add_to_points(point_grad, samples, positions, wanted, level, decoder, dc, a0, a3)
         if weights.wanted != 0:
@@ -154,8 +163,9 @@ def color_kernels(build: Build) -> dict[str, wp.Kernel]:
                 weights.rows[slot, OUT_32 + 3] = weights.rows[slot, OUT_32 + 3] + bias
             for chunk in range(3):
                 da = angle_adjoint(positions, decoder, chunk, a0, a3)
+                e = embed(positions, decoder.W, chunk)
                 if wp.static(on_cpu):
-                    store_rows(weights.layer_grad, rows, 10 + chunk, embed(positions, decoder.W, chunk), weights.wanted)
+                    store_rows(weights.layer_grad, rows, 10 + chunk, e, weights.wanted)
                     for axis in range(3):
                         coordinate = Scalars()
                         for p in range(size):
@@ -163,6 +173,7 @@ def color_kernels(build: Build) -> dict[str, wp.Kernel]:
                         add_sum(weights.rows, slot, B + 3 * chunk + axis, scaled(coordinate, da))
                 else:
                     store_rows(weights.layer_grad, rows, 10 + chunk, da, weights.wanted)
+                    store_rows(weights.layer_grad, rows, 14 + chunk, e, weights.wanted)
 
     @build.kernel
     def color_backward(
@@ -198,74 +209,94 @@ def color_kernels(build: Build) -> dict[str, wp.Kernel]:
                     add_outer(weights, listed.slot, E3 + 32 * chunk, 10 + chunk, 3)
 
     @build.kernel
-    def color_weights(
-        point_count: int,
-        chunk_size: int,
-        rays: Rays,
-        decoder: Weights,
-        color_grad: wp.array[wp.vec3],
-        weights: WeightGradient,
-    ):
-        """Sum the weight gradient over a chunk of points: x^T d for each layer, one thread a row of the weights
-        (CUDA).
-        """
-        block, row = wp.tid()
-        first = block * chunk_size
-        last = wp.min(first + chunk_size, point_count)
-        total = Vec32()
-        for n in range(first, last):
-            d = color_grad[n]
-            if d[0] != 0.0 or d[1] != 0.0 or d[2] != 0.0:
-                x = float(1.0)
-                column = int(0)
-                if row < E0:
-                    chunk = row // 3
-                    x = sample_point(n, rays)[row - 3 * chunk]
-                    column = 10 + chunk
-                elif row < W1:
-                    j = row - E0
-                    if j >= 96:
-                        j -= 96
-                        column = 3
-                    x = sine_cosine(angles(sample_point(n, rays), decoder.W, j // 32)[j % 32])[0]
-                elif row < BIAS:
-                    layer = (row - W1) // 32
-                    x = weights.activations[n, layer][row - W1 - 32 * layer]
-                    column = layer + 1
-                elif row < V:
-                    column = row - BIAS
-                elif row < OUT_32:
-                    layer = (row - V) // 32
-                    x = weights.layer_grad[n, 13][row - V - 32 * layer]
-                    column = 5 + layer
-                if row < OUT_32:
-                    total += x * weights.layer_grad[n, column]
-                elif row < OUT_32 + 3:
-                    total += d[row - OUT_32] * weights.activations[n, 4]
-                else:
-                    for k in range(3):
-                        total[k] += d[k]
-        wp.atomic_add(weights.rows, 0, row, total)
+    def color_weights(listed: Listed, rays: Rays, color_grad: wp.array[wp.vec3], weights: WeightGradient):
+        """Sum the weight gradient x^T d of a part of the listed samples into a buffer (CUDA).
 
-    @build.kernel
-    def transpose_color_weights(W: wp.array[Vec32], T: wp.array[Vec32]):
-        """Bring the transposed rows in line with the weights: one thread a row of ``T`` (480)."""
-        row = wp.tid()
+        A thread a row, 32 rows of one matrix side by side, so that they share what is read of d; single rows come last.
+        """
+        slot, section, lane = wp.tid()
+        count = listed_count(listed)
+        share = (count + weights.rows.shape[0] - 1) // weights.rows.shape[0]
+        # Columns of what the samples stored: of d, and of x, which for W_1..W_4 is h_0..h_3.
+        d = int(0)
+        x = int(0)
+        target = lane
+        from_activations = section >= 6 and section < 10
+        if section < 3:
+            x = 14 + section
+            target += E0 + 32 * section
+        elif section < 6:
+            d = 3
+            x = 14 + section - 3
+            target += E3 + 32 * (section - 3)
+        elif section < 10:
+            d = section - 5
+            x = section - 6
+            target += W1 + 32 * (section - 6)
+        elif section < 15:
+            d = section - 5
+            x = 13
+            target += V + 32 * (section - 10)
+        elif lane < E0:
+            d = 10 + lane // 3
+        elif lane < E0 + 10:
+            d = lane - E0
+            target += BIAS - E0
+        else:
+            target += OUT_32 - E0 - 10
+        if target >= COLOR_WEIGHT_ROWS:
+            return
+        total = Vec32()
+        for place in range(slot * share, wp.min(slot * share + share, count)):
+            sample = listed.samples[listed.start + place]
+            if target < OUT_32:
+                factor = float(1.0)
+                if from_activations:
+                    factor = entry(weights.activations, sample, x, lane)
+                elif section < 15:
+                    factor = entry(weights.layer_grad, sample, x, lane)
+                elif lane < E0:
+                    factor = sample_point(sample, rays)[lane - 3 * (lane // 3)]
+                total = add_scaled_column(total, factor, weights.layer_grad, sample, d)
+            elif target < OUT_32 + 3:
+                by_color = color_grad[sample]
+                total = add_scaled_column(total, by_color[target - OUT_32], weights.activations, sample, 4)
+            else:
+                by_color = color_grad[sample]
+                for k in range(3):
+                    total[k] += by_color[k]
+        weights.rows[slot, target] = weights.rows[slot, target] + total
+
+    @build.func
+    def transposed_source(row: int) -> int:
+        """First row of the matrix whose transpose a row belongs to."""
         block = row // 32
-        j = row - 32 * block
-        source = int(0)
+        source = V + 32 * (block - 10)
         if block < 3:
             source = E0 + 32 * block
         elif block < 6:
             source = E3 + 32 * (block - 3)
         elif block < 10:
             source = W1 + 32 * (block - 6)
-        else:
-            source = V + 32 * (block - 10)
+        return source
+
+    @build.kernel
+    def transpose_color_weights(W: wp.array[Vec32], T: wp.array[Vec32]):
+        """Bring the transposed rows in line with the weights: one thread a row of ``T`` (480)."""
+        row = wp.tid()
+        source = transposed_source(row)
         r = Vec32()
         for k in range(32):
-            r[k] = W[source + k][j]
+            r[k] = W[source + k][row % 32]
         T[row] = r
 
-    kernels = (color_forward, color_backward, color_weights, transpose_color_weights)
+    @build.kernel
+    def transpose_color_entries(W: wp.array2d[float], T: wp.array2d[float]):
+        """The same, one thread a number (CUDA)."""
+        row, k = wp.tid()
+        T[row, k] = W[transposed_source(row) + k, row % 32]
+
+    kernels = [color_forward, color_backward, transpose_color_weights]
+    if not on_cpu:
+        kernels += [color_weights, transpose_color_entries]
     return {kernel.key: kernel for kernel in kernels}

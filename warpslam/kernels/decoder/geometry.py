@@ -92,7 +92,7 @@ def geometry_kernels(build: Build) -> dict[str, wp.Kernel]:
         dc, a0, a3 = layers_backward(g4, decoder, samples, listed.slot, Indices(), WeightGradient())
         positions = positions_of(samples, rays)
         if grid.wanted != 0:
-            add_to_grid(grid, listed.slot, level, positions, wanted, dc)
+            add_to_grid(grid, listed.slot, level, samples, positions, wanted, dc)
         if want_point != 0:
             add_to_points(point_grad, samples, positions, wanted, level, decoder, dc, a0, a3)
 

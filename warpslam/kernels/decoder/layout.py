@@ -38,13 +38,25 @@ C_BIAS = 192
 C_OUT = 197
 
 COLOR_WEIGHT_ROWS = OUT_32 + 4
+STORED_COLUMNS = 17
+WEIGHT_SECTIONS = 16
+"""Groups of 32 rows, each of one matrix, in which `color_weights` takes the weights; the last has the single rows."""
+
 MASK_WORDS = 5
 
 BLOCK_SIZE = {"cpu": 4, "cuda": 1}
 """Samples of a block."""
 
-GROUP_SIZE = {"cpu": 8, "cuda": 16}
-"""Samples of a ray between two looks at its transmittance."""
+GROUP_SIZE = {"cpu": 8, "cuda": 1 << 30}
+"""Samples of a ray between two looks at its transmittance. On CUDA a second look costs more than it spares: a launch
+over a third of the samples takes as long as one over all.
+"""
+
+RUN = 8
+"""Samples of a list whose gradients a thread of `scatter_features` adds up before it goes to memory."""
+
+WEIGHT_SLOTS = 128
+"""Buffers of the colour decoder's weight gradient on CUDA."""
 
 WEIGHT_GROUP = 16
 """Samples that a CPU thread of `color_backward` sums weight gradients over before it adds them to memory."""
@@ -67,11 +79,21 @@ class Weights:
 
 @wp.struct
 class RowGradient:
-    """Gradient of a grid: whether it is wanted, which rows are selected, and the buffers (slices, rows) it goes to."""
+    """Gradient of a grid.
+
+    wanted: Whether it is.
+    selected: Which rows get one.
+    rows: The buffers (slices, rows) it goes to.
+    by_sample: Gradient of the feature of each sample (samples, 1), which `scatter_features` brings there (CUDA).
+    entries, entries_by_sample: The same memory as of both, one number an element (CUDA).
+    """
 
     wanted: int
     selected: wp.array[wp.uint8]
     rows: wp.array2d[Vec32]
+    by_sample: wp.array2d[Vec32]
+    entries: wp.array3d[float]
+    entries_by_sample: wp.array2d[float]
 
 
 @wp.struct
@@ -84,7 +106,8 @@ class WeightGradient:
     layer_grad: On the CPU a slice has the rows of one group, with a_0..a_4, g_0..g_4, the embedding (3 columns), the
         feature and h_0..h_3 of its samples: the gradient of the weights is twice as large as a CPU's first cache, so
         that a row of it is fetched once a group and not once a block. On CUDA thousands of threads would queue for the
-        same rows: all samples store (a_0..a_4, g_0..g_4, those of the angles, the feature), and `color_weights` sums.
+        same rows: all samples store `STORED_COLUMNS`, a_0..a_4, g_0..g_4, the gradients of the angles (3), the feature
+        and the embedding (3), and `color_weights` sums.
     layer_inputs: The same memory, one number an element (CPU).
     """
 

@@ -1,0 +1,119 @@
+"""Rows of 32 read and written 16 bytes at a time, as CUDA wants it.
+
+Warp aligns a `Vec32` to 4 bytes, so that its own code loads one number at a time, and the kernels wait for the loads.
+Rows of arrays lie at multiples of 128 bytes.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from warpslam.kernels.grid import Vec32
+
+# Four rows a trip, in a rolled loop.
+_MATVEC = """
+    struct alignas(16) quad { float a, b, c, d; };
+    wp::mat_t<1, 32, wp::float32> s = r;
+    const quad* w = (const quad*)(W.data + row);
+    #pragma unroll 1
+    for (int k = 0; k < 32; k += 4) {
+        #pragma unroll
+        for (int n = 0; n < 4; ++n) {
+            const wp::float32 x_n = x.data[0][k + n];
+            #pragma unroll
+            for (int i = 0; i < 8; ++i) {
+                const quad q = w[8 * n + i];
+                s.data[0][4 * i] += x_n * q.a;
+                s.data[0][4 * i + 1] += x_n * q.b;
+                s.data[0][4 * i + 2] += x_n * q.c;
+                s.data[0][4 * i + 3] += x_n * q.d;
+            }
+        }
+        w += 32;
+    }
+    return s;
+"""
+
+_ADD_SCALED = """
+    struct alignas(16) quad { float a, b, c, d; };
+    wp::vec_t<32, wp::float32> t = r;
+    const quad* w = (const quad*)(rows.data + AT);
+    #pragma unroll
+    for (int i = 0; i < 8; ++i) {
+        const quad q = w[i];
+        t.c[4 * i] += s * q.a;
+        t.c[4 * i + 1] += s * q.b;
+        t.c[4 * i + 2] += s * q.c;
+        t.c[4 * i + 3] += s * q.d;
+    }
+    return t;
+"""
+
+_DOT_ROW = """
+    struct alignas(16) quad { float a, b, c, d; };
+    const quad* w = (const quad*)(rows.data + row);
+    quad t = {0.0f, 0.0f, 0.0f, 0.0f};
+    #pragma unroll
+    for (int i = 0; i < 8; ++i) {
+        const quad q = w[i];
+        t.a += r.c[4 * i] * q.a;
+        t.b += r.c[4 * i + 1] * q.b;
+        t.c += r.c[4 * i + 2] * q.c;
+        t.d += r.c[4 * i + 3] * q.d;
+    }
+    return (t.a + t.b) + (t.c + t.d);
+"""
+
+_PUT_ROW = """
+    struct alignas(16) quad { float a, b, c, d; };
+    quad* w = (quad*)(rows.data + row * rows.shape[1] + column);
+    #pragma unroll
+    for (int i = 0; i < 8; ++i) {
+        quad q;
+        q.a = r.c[4 * i];
+        q.b = r.c[4 * i + 1];
+        q.c = r.c[4 * i + 2];
+        q.d = r.c[4 * i + 3];
+        w[i] = q;
+    }
+"""
+
+
+def native_matvec(Block: type) -> Any:
+    """r + x W[row:] of one sample."""
+
+    # Warp takes the type of the result from a decorator that is spelt like this.
+    @wp.func_native(_MATVEC)
+    def matvec(r: Block, x: Block, W: wp.array[Vec32], row: int) -> Block: ...
+
+    return matvec
+
+
+@wp.func_native(_ADD_SCALED.replace("AT", "row"))
+def add_scaled(r: Vec32, s: float, rows: wp.array[Vec32], row: int) -> Vec32:
+    """r + s * rows[row]."""
+    ...
+
+
+@wp.func_native(_ADD_SCALED.replace("AT", "row * rows.shape[1] + column"))
+def add_scaled_column(r: Vec32, s: float, rows: wp.array2d[Vec32], row: int, column: int) -> Vec32:
+    """r + s * rows[row, column]."""
+    ...
+
+
+@wp.func_native(_DOT_ROW)
+def dot_row(r: Vec32, rows: wp.array[Vec32], row: int) -> float:
+    """Product of a vector and a row."""
+    ...
+
+
+@wp.func_native(_PUT_ROW)
+def put_row(rows: wp.array2d[Vec32], row: int, column: int, r: Vec32):
+    """rows[row, column] = r."""
+    ...
+
+
+@wp.func_native("return ((const float*)(rows.data + row * rows.shape[1] + column))[k];")
+def entry(rows: wp.array2d[Vec32], row: int, column: int, k: int) -> float:
+    """rows[row, column][k], and nothing else of the row."""
+    ...
