@@ -47,7 +47,7 @@ def vector_from_pose(T: np.ndarray) -> np.ndarray:
 
 
 def pose_from_vector(vector: np.ndarray) -> np.ndarray:
-    """Transform (4, 4), float64, of a pose vector (qw, qx, qy, qz, tx, ty, tz), whose quaternion may have any length."""
+    """Transform (4, 4), float64, of a pose vector (qw, qx, qy, qz, tx, ty, tz); the quaternion may have any length."""
     vector = np.asarray(vector, dtype=np.float64)
     T = np.eye(4)
     T[:3, :3] = Rotation.from_quat(vector[:4], scalar_first=True).as_matrix()
