@@ -1,4 +1,4 @@
-"""Passes through the field: occupancy and colour of samples (Eq. 1-4), rendering (Eq. 5-7), and the adjoint of both."""
+"""Passes through the field: occupancy and colour of samples (Eq. 1-5), rendering (Eq. 6-7), and the adjoint of both."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def render(
     *,
     thresholds: Thresholds = EXACT,
 ) -> None:
-    """Depth, colour and variance of every ray (Eq. 5-7).
+    """Depth, colour and variance of every ray (Eq. 6-7).
 
     gradients, tape: What to differentiate, and the tape that gets the adjoint; both or neither.
     """
@@ -162,7 +162,7 @@ def _colors(
     min_weight: float,
     weight_gradient: wp.array | None = None,
 ) -> list[Step]:
-    """Colour (Eq. 4) of the samples that weigh at least ``min_weight``."""
+    """Colour (Eq. 5) of the samples that weigh at least ``min_weight``."""
     samples = batch.sample_count
     dim = batch.kernels.thread_count((stop - first) * samples)
     listed = _listed(batch, first, slot, batch.weighty, batch.weighty_count)

@@ -1,4 +1,4 @@
-"""Occupancy and volume rendering (Eq. 5-7).
+"""Occupancy and volume rendering (Sec. 3.2, Eq. 6-7).
 
     alpha_i = sigmoid(10 logit_i),  1 for samples outside the map's bound (logit 100)
     w_i     = alpha_i T_i,          T_i = prod_{j < i} (1 - alpha_j + 1e-10)
