@@ -7,9 +7,9 @@ adjoints give that of a logit by its point once for both, since they are linear 
     d depth / d p_i = (d depth / d logit_i) (d logit_i / d p_i)
     d grey  / d p_i = (d grey / d logit_i) (d logit_i / d p_i) + w_i mean_c (d color_i / d p_i)
 
-Absolute residuals of Eq. 11 are reweighted as squares, |r| ~ r^2 / max(|r|, floor). One thread sums and solves, so that the sum
-has one order; on CUDA, where that takes half as long as the rendering, threads sum parts of it, in one order, too
-(`normal_parts`), and the stages along rays have a thread a sample (`warpslam.kernels.by_sample`).
+Absolute residuals of Eq. 11 are reweighted as squares, |r| ~ r^2 / max(|r|, floor). One thread sums and solves, so
+that the sum has one order; on CUDA, where that takes half as long as the rendering, threads sum parts of it, in one
+order, too (`normal_parts`), and the stages along rays have a thread a sample (`warpslam.kernels.by_sample`).
 """
 
 import warp as wp
