@@ -57,7 +57,11 @@ def write_state(path: Path, form: StateFormat, header: dict[str, Any], arrays: d
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path, durable=True) as partial:
+            partial.touch()
+            mode = partial.stat().st_mode
             save_file(native, partial, {_KEY: json.dumps(metadata)})
+            # safetensors leaves a file that none but its owner can read.
+            partial.chmod(mode)
             digest, place = _digest(partial, _NO_DIGEST)
             with open(partial, "r+b") as file:
                 file.seek(place)
