@@ -39,7 +39,6 @@ from tools.gpu.ptx_translator import Translator, UnsupportedInstruction
 
 CACHE = Path(os.environ.get("PTX_ON_CPU_CACHE", Path(tempfile.gettempdir(), "ptx_on_cpu")))
 ARCHITECTURE = int(os.environ.get("PTX_ON_CPU_ARCH", "90"))
-BLOCK = 256
 
 
 def c_compiler() -> str | None:
@@ -116,7 +115,14 @@ class Module:
         return self._libraries[name]
 
     def launch(
-        self, name: str, params: list, dim: int, ranges: list[tuple[int, int]] | None, *, shuffle: bool = False
+        self,
+        name: str,
+        params: list,
+        dim: int,
+        ranges: list[tuple[int, int]] | None,
+        *,
+        block: int = 256,
+        shuffle: bool = False,
     ) -> None:
         """Run a kernel.
 
@@ -125,6 +131,7 @@ class Module:
             params: ctypes objects, the launch bounds first.
             dim: Number of threads that have work.
             ranges: First and last address + 1 of each array, for a module that was built to check.
+            block: Threads of a block; what the module was compiled for.
             shuffle: Blocks and threads in another order.
 
         Raises:
@@ -135,8 +142,8 @@ class Module:
         pointers = (ctypes.c_void_p * len(params))(*(ctypes.addressof(p) for p in params))
         shared = (ctypes.c_uint8 * max(self.translator.shared_bytes, 16))()
         context = Context(params=ctypes.addressof(pointers), shared=ctypes.addressof(shared))
-        blocks = max(-(-dim // BLOCK), 1)
-        context.ntid[:] = [BLOCK, 1, 1]
+        blocks = max(-(-dim // block), 1)
+        context.ntid[:] = [block, 1, 1]
         context.nctaid[:] = [blocks, 1, 1]
         if ranges:
             table = (Range * len(ranges))(*(Range(*r) for r in ranges))
@@ -226,7 +233,8 @@ class Runner:
         module = self.module(kernel.module.name)
         start = time.perf_counter()
         name = f"{kernel.get_mangled_name()}_cuda_kernel_{suffix}"
-        module.launch(name, params, bounds.size, ranges if self.check else None, shuffle=self.shuffle)
+        block = kernel.module.options["block_dim"]
+        module.launch(name, params, bounds.size, ranges if self.check else None, block=block, shuffle=self.shuffle)
         self.seconds[kernel.key] += time.perf_counter() - start
 
     def table(self) -> str:
