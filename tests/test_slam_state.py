@@ -193,8 +193,8 @@ def test_memory_report_adds_up(frames):
     parts = report["grid_bytes"] + report["keyframe_bytes"] + report["seen_bytes"]
     assert report["state_bytes"] == parts and report["seen_bytes"] == 2 * 9 * 12
     cone = 3.0**3 / 3 * (48 / 40) * (36 / 40)
-    # Cells at the border count whole.
-    assert cone < observed < 1.6 * cone
+    # Cells at the border count whole; a hundred rays leave some between them at the far end.
+    assert 0.6 * cone < observed < 1.6 * cone
     assert report["state_bytes_per_observed_m3"] == pytest.approx(parts / observed)
 
 

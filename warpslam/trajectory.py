@@ -209,12 +209,15 @@ class FrameHistory:
         last = self.last_known
         if last is None:
             return False
-        recent = [motion_between(self._poses[n - 1], self._poses[n]) for n in self._recent() if self._follows(n)]
+        recent = [n for n in self._recent() if self._follows(n)]
         # Before any step is known the camera may be a fast one.
-        usual = np.median(recent, axis=0) if recent else np.array([max_step, max_turn])
+        usual = np.array([max_step, max_turn])
+        if recent:
+            before, after = (np.array([self._poses[n + shift] for n in recent]) for shift in (-1, 0))
+            usual = np.median(motion_between(before, after), axis=0)
         elapsed = len(self) - last
         step = motion_between(self._poses[last], T_world_camera)
-        return bool((np.array(step) > elapsed * np.maximum(STEP_FACTOR * usual, [max_step, max_turn])).any())
+        return bool((step > elapsed * np.maximum(STEP_FACTOR * usual, [max_step, max_turn])).any())
 
     def depth_error(self) -> float:
         """Median depth error of the recent frames [m], 0 if there are none."""

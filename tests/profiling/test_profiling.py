@@ -19,6 +19,7 @@ from warpslam.field import passes
 from warpslam.field.arrays import Gradients, Thresholds
 from warpslam.field.passes import render
 from warpslam.kernels.decoder.build import decoders_for
+from warpslam.kernels.samples import Span
 from warpslam.profiling import costs, recorder
 from warpslam.runtime import launching, phases, program
 from warpslam.runtime.phases import phase
@@ -35,7 +36,7 @@ KERNELS = {
     "mapping_loss (adjoint)", "tracking_loss",
     "tracking_loss (adjoint)", "cast_rays (adjoint)", "tracking_residuals", "choose_inliers", "lower_median",
     "adam_rows", "adam_poses", "advance_step", "note_pose", "take_pose", "note_rays",
-    "transpose_color_weights", "classify_points", "find_facing",
+    "transpose_color_weights", "classify_points", "find_facing", "to_metres",
 }  # fmt: skip
 HOOKED = (
     (warp_context, "invoke"), (wp, "launch"), (wp.Launch, "launch"), (wp.Module, "load"), (program, "_pool"),
@@ -251,7 +252,7 @@ def test_counted_points_are_those_computed(frames, min_transmittance, monkeypatc
     batch.point_grad.zero_()
     batch.steep_count.zero_()
     batch.launcher.launch(*passes.steep_samples(batch, 0, batch.count, 0, 0.25))
-    step = passes.geometry_adjoint(batch, arrays, "middle", Gradients(points=True), 0, batch.count, 0, batch.point_grad)
+    (step,) = passes.geometry_adjoint(batch, arrays, "middle", Gradients(points=True), 0, batch.count, 0)
     with warpslam.profile() as profile:
         batch.launcher.launch(*step)
     (launch,) = profile.launches
@@ -275,7 +276,9 @@ def test_what_cannot_be_counted_is_a_bound(frames):
     """Arrays that lie on another device leave the number of points of the launch, and say so."""
     slam = new_slam()
     names = [argument.label for argument in decoders_for(slam.device).middle_forward.adj.args]
-    values = [dict(point_count=800, width=8, first_ray=0).get(name) for name in names]
+    span = Span()
+    span.point_count, span.width, span.first_ray = 800, 8, 0
+    values = [span if name == "span" else None for name in names]
     kernel = decoders_for(slam.device).middle_forward
     work = costs.work_of(kernel, False, 200, costs.Arguments(kernel, values, readable=False))
     assert (work.points, work.counted) == (800, False)

@@ -58,6 +58,13 @@ def test_comes_back_as_it_was(content, tmp_path):
     assert [file.name for file in path.parent.iterdir()] == ["b.safetensors"]
 
 
+def test_others_may_read_what_they_may_read_elsewhere(tmp_path):
+    """The permissions are those of any new file here."""
+    write_state(tmp_path / "a.safetensors", FORM, HEADER, ARRAYS)
+    (tmp_path / "b").write_bytes(b"")
+    assert (tmp_path / "a.safetensors").stat().st_mode == (tmp_path / "b").stat().st_mode
+
+
 def test_safetensors_reads_the_same(content):
     """The published package finds every array."""
     arrays = safetensors.numpy.load(content)

@@ -182,7 +182,7 @@ def _strata(rays: int, count: int, generator: torch.Generator) -> Tensor:
 
 
 def query_occupancy(decoders: DecoderSet, stage: str, points: Tensor, features: dict, stencils: dict) -> Tensor:
-    """Occupancy logits (N,) at world points (N, 3): coarse, or middle plus, from the fine stage on, fine (Eq. 1-3)."""
+    """Occupancy logits (N,) at world points (N, 3): coarse, or middle plus, from the fine stage on, fine (Eq. 1-4)."""
     if stage == "coarse":
         return decoders.coarse(points, interpolate(features["coarse"], stencils["coarse"]))
     middle = interpolate(features["middle"], stencils["middle"])
@@ -193,14 +193,14 @@ def query_occupancy(decoders: DecoderSet, stage: str, points: Tensor, features: 
 
 
 def ray_weights(logits: Tensor) -> Tensor:
-    """Compositing weights (P, S) of logits (P, S) (Eq. 6)."""
+    """Compositing weights (P, S) of logits (P, S) (Sec. 3.2)."""
     alpha = torch.sigmoid(OCCUPANCY_GAIN * logits)
     passed = torch.cumprod(1.0 - alpha + 1e-10, dim=1)
     return alpha * torch.cat([torch.ones_like(passed[:, :1]), passed[:, :-1]], dim=1)
 
 
 def render(decoders: DecoderSet, stage: str, batch: Batch, features: dict) -> tuple[Tensor, Tensor | None]:
-    """Distance (P,) [m] and, in the colour stage, colour (P, 3) of rays (Eq. 7)."""
+    """Distance (P,) [m] and, in the colour stage, colour (P, 3) of rays (Eq. 6)."""
     points = batch.points.flatten(0, 1)
     weights = ray_weights(query_occupancy(decoders, stage, points, features, batch.stencils).view(batch.z.shape))
     distance = (weights * batch.z).sum(dim=1)

@@ -52,7 +52,7 @@ class TrainingConfig:
     scene_count: int = 12  # rooms that are mapped in one episode of phase 2
     turn_count: int = 2  # of these, how many take a step at a time
     camera_count: int = 2  # views of each
-    coarse_share: float = 0.0  # of the rooms of an episode, for the coarse level alone; see PRETRAINING.md
+    coarse_share: float = 0.0  # of the rooms of an episode, for the coarse level alone; see README.md
     finer_share: float = 0.25  # of the other rooms, with half the vertex spacing
     first_share: float = 0.2  # of the rooms, at the learning rates of a run's first frame
     ray_count: int = 160  # rays of a room in one step

@@ -507,7 +507,7 @@ def engine_calls(engine: Any, index: int, frame: Any) -> dict[str, tuple[Callabl
         "mapping call ms": (lambda: engine.mapper.map_frame(images, index, pose, engine.keyframes), 3),
         "track ms": (lambda: engine.tracker.track(engine.scene.arrays(), images, index, frame.T_world_camera), 10),
         "set image ms": (lambda: images.set(0, frame.rgb, frame.depth), 10),
-        "keyframe image ms": (lambda: images.add(frame.rgb, frame.depth), 3),
+        "keyframe image ms": (images.keep_current, 3),
     }
 
 
@@ -548,42 +548,20 @@ def examine(program: Any, batch: Any, repeats: int) -> Figures:
     rows = []
     for command, us in zip(commands, medians, strict=True):
         label = command.kernel.key + (" (adjoint)" if command.adjoint else "")
-        row: Figures = {"kernel": label, "threads": int(command.bounds.size), "us": round(float(us), 2)}
-        if device.is_cuda and _is_decoder(command) and not command.kernel.key.startswith("transpose"):
-            for size in _BLOCK_SIZES:
-                command.block_dim = size
-                row[f"us_at_{size}"] = round(float(np.median([stopwatch(command.launch) for _ in range(repeats)])), 2)
-            command.block_dim = _BLOCK_SIZES[0]
-        rows.append(row)
+        rows.append({"kernel": label, "threads": int(command.bounds.size), "us": round(float(us), 2)})
     figures: Figures = {
         "launches": len(commands),
         "steps": len(program._steps),
         "sum_us": round(float(medians.sum()), 1),
     }
     if device.is_cuda:
-        for size in _BLOCK_SIZES:
-            for command in commands:
-                command.block_dim = size if _is_decoder(command) else _BLOCK_SIZES[0]
+        with wp.ScopedCapture(device) as capture:
             batch.iteration.zero_()
-            with wp.ScopedCapture(device) as capture:
-                batch.iteration.zero_()
-                program._replay()
-            wp.capture_launch(capture.graph)
-            us = [stopwatch(partial(wp.capture_launch, capture.graph)) for _ in range(repeats)]
-            figures[f"graph_us_with_decoders_at_{size}"] = round(float(np.median(us)), 1)
-        for command in commands:
-            command.block_dim = _BLOCK_SIZES[0]
+            program._replay()
+        wp.capture_launch(capture.graph)
+        us = [stopwatch(partial(wp.capture_launch, capture.graph)) for _ in range(repeats)]
+        figures["graph_us"] = round(float(np.median(us)), 1)
     return {**figures, "rows": rows}
-
-
-_BLOCK_SIZES = (32,)
-"""Threads of a block; the first is what launches have, and what the modules are compiled for: more would write behind
-the end of shared memory.
-"""
-
-
-def _is_decoder(command: Any) -> bool:
-    return "decoder" in command.kernel.module.name
 
 
 # -- commands and other tools ------------------------------------------------------------------------------------------

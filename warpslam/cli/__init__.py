@@ -30,7 +30,7 @@ COMMANDS = {
     "profile": ("profile", "time of every kernel of a run; writes no run folder"),
     "render-room": ("render_room", "rendered rooms: RGB-D sequences with their truth, and pictures"),
     "warmup": ("warmup", "compile all kernels ahead of the first run"),
-    "info": ("info", "versions, devices, decoders, dataset formats and presets"),
+    "info": ("info", "versions, devices, decoders, dataset formats, presets and settings"),
 }
 """Commands in the order of ``warpslam --help``: the module here whose ``add(commands)`` adds them, and what they do."""
 

@@ -15,7 +15,7 @@ from warpslam.examples.first_steps import CAMERA, SETTINGS
 from warpslam.synthetic import SyntheticSequence
 
 
-def main(frame_count: int = 15, *, settings: Sequence[str] = SETTINGS, output: Path = Path("known_poses.png")) -> float:
+def main(frame_count: int = 10, *, settings: Sequence[str] = SETTINGS, output: Path = Path("known_poses.png")) -> float:
     """Map, and write the last frame beside its rendering; returns the median error of the rendered depth [m]."""
     sequence = SyntheticSequence(room_seed=0, frame_count=frame_count, intrinsics=CAMERA)
     settings = [*settings, "tracking.use_given_poses=true"]

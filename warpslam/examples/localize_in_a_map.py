@@ -15,7 +15,7 @@ from warpslam.examples.first_steps import CAMERA, SETTINGS
 from warpslam.synthetic import SyntheticSequence
 
 
-def main(frame_count: int = 20, *, settings: Sequence[str] = SETTINGS) -> float:
+def main(frame_count: int = 14, *, settings: Sequence[str] = SETTINGS) -> float:
     """Map, save, load, and localize every third frame backwards; returns the largest error of position [m]."""
     sequence = SyntheticSequence(room_seed=0, frame_count=frame_count, intrinsics=CAMERA)
     slam = warpslam.Slam(CAMERA, warpslam.Config.from_preset("default", list(settings)))

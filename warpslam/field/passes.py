@@ -1,4 +1,4 @@
-"""Passes through the field: occupancy and colour of samples (Eq. 1-4), rendering (Eq. 5-7), and the adjoint of both."""
+"""Passes through the field: occupancy and colour of samples (Eq. 1-5), rendering (Eq. 6-7), and the adjoint of both."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def render(
     *,
     thresholds: Thresholds = EXACT,
 ) -> None:
-    """Depth, colour and variance of every ray (Eq. 5-7).
+    """Depth, colour and variance of every ray (Eq. 6-7).
 
     gradients, tape: What to differentiate, and the tape that gets the adjoint; both or neither.
     """
@@ -168,7 +168,7 @@ def _logits(
 def _weigh_by_ray(
     batch: RayBatch, arrays: FieldArrays, stage: str, first: int, stop: int, slot: int, thresholds: Thresholds
 ) -> list[Step]:
-    """Weights, depth and variance (Eq. 5-7), and the list of the samples that need colour; group by group of samples,
+    """Weights, depth and variance (Eq. 6-7), and the list of the samples that need colour; group by group of samples,
     until a ray's light is spent.
     """
     samples, ray_count = batch.sample_count, stop - first
@@ -211,7 +211,7 @@ def _weighty_samples(batch: RayBatch, first: int, stop: int, slot: int, min_weig
 def _color_forward(
     batch: RayBatch, arrays: FieldArrays, first: int, stop: int, slot: int, weight_gradient: wp.array | None = None
 ) -> Step:
-    """Colour (Eq. 4) of the samples that are listed for it."""
+    """Colour (Eq. 5) of the samples that are listed for it."""
     inputs = [_listed(batch, first, slot, batch.weighty, batch.weighty_count), batch.rays, arrays.level("color")]
     inputs += [_weights(batch, arrays, "color"), _weight_gradient(batch, weight_gradient), batch.color]
     return (batch.kernels.color_forward, batch.kernels.thread_count((stop - first) * batch.sample_count), inputs)

@@ -1,4 +1,4 @@
-"""Whole images of the map: depth, colour and variance (Eq. 5-7)."""
+"""Whole images of the map: depth, colour and variance (Eq. 6-7)."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Occupancy and volume rendering (Eq. 5-7).
+"""Occupancy and volume rendering (Sec. 3.2, Eq. 6-7).
 
     alpha_i = sigmoid(10 logit_i),  1 for samples outside the map's bound (logit 100)
     w_i     = alpha_i T_i,          T_i = prod_{j < i} (1 - alpha_j + 1e-10)
-    depth   = sum w_i z_i,   rgb = sum w_i c_i,   variance = sum w_i (z_i - depth)^2
+    depth   = sum w_i z_i,   rgb = sum w_i c_i                    Eq. 6
+    variance = sum w_i (z_i - depth)^2                            Eq. 7
 
 Adjoint, for incoming d_depth and d_rgb (the losses detach the variance), with g_i = d_depth z_i + d_rgb . c_i:
 

@@ -1,4 +1,4 @@
-"""Gauss-Newton on the pose of one frame: derivatives of rendered depth and grey value, normal equations, step.
+"""Gauss-Newton on the pose of one frame (Eq. 12): derivatives of rendered depth and grey value, equations, step.
 
 With o' = o + t and d' = d + w x d for a motion (t, w) in world axes, turning about the camera centre, a sample at p
 moves by t + z w x d. Compositing gives the derivative of a ray's depth, or grey value, by each logit; the decoders'
@@ -7,9 +7,9 @@ adjoints give that of a logit by its point once for both, since they are linear 
     d depth / d p_i = (d depth / d logit_i) (d logit_i / d p_i)
     d grey  / d p_i = (d grey / d logit_i) (d logit_i / d p_i) + w_i mean_c (d color_i / d p_i)
 
-Absolute residuals are reweighted as squares, |r| ~ r^2 / max(|r|, floor). One thread sums and solves, so that the sum
-has one order; on CUDA, where that takes half as long as the rendering, threads sum parts of it, in one order, too
-(`normal_parts`), and the stages along rays have a thread a sample (`warpslam.kernels.by_sample`).
+Absolute residuals of Eq. 11 are reweighted as squares, |r| ~ r^2 / max(|r|, floor). One thread sums and solves, so
+that the sum has one order; on CUDA, where that takes half as long as the rendering, threads sum parts of it, in one
+order, too (`normal_parts`), and the stages along rays have a thread a sample (`warpslam.kernels.by_sample`).
 """
 
 import warp as wp

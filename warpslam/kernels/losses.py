@@ -1,9 +1,9 @@
 """Losses of mapping (Eq. 8-10) and tracking (Eq. 11-12), as sums over rays like the released code, or as means.
 
-    mapping:   L = sum_{kept, D > 0} |D - D^|  +  lambda_p sum_kept |I - I^|_1
-    tracking:  r = |D - D^| / sqrt(V + 1e-10), V detached
+    mapping:   L = sum_{kept, D > 0} |D - D^|  +  lambda_p sum_kept |I - I^|_1      Eq. 8, 9, 10
+    tracking:  r = |D - D^| / sqrt(V + 1e-10), V detached                           Eq. 11
                inlier: D > 0 and (r < 10 median(r) where the dynamic filter is on)
-               L = sum_inlier r  +  lambda_pt sum_inlier |I - I^|_1
+               L = sum_inlier r  +  lambda_pt sum_inlier |I - I^|_1                 Eq. 12
 
 |.|_1 sums the three channels. The loss kernels are differentiated by the tape; residuals and the choice of inliers
 have no gradient.

@@ -28,7 +28,6 @@ _STAGES = (
     "kernels.losses",
     "kernels.grid",
     "views",
-    "kernels.images",
 )
 _PYTHON_MODULES = {
     "warpslam.rays": ("pixels", "rays", "rejection", "samples"),

@@ -57,7 +57,11 @@ def write_state(path: Path, form: StateFormat, header: dict[str, Any], arrays: d
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path, durable=True) as partial:
+            partial.touch()
+            mode = partial.stat().st_mode
             save_file(native, partial, {_KEY: json.dumps(metadata)})
+            # safetensors leaves a file that none but its owner can read.
+            partial.chmod(mode)
             digest, place = _digest(partial, _NO_DIGEST)
             with open(partial, "r+b") as file:
                 file.seek(place)
@@ -85,7 +89,8 @@ def read_state(path: Path, form: StateFormat) -> tuple[dict[str, Any], dict[str,
             metadata = _metadata(path, file.metadata())
             if _digest(path, metadata["sha256"])[0] != metadata["sha256"]:
                 raise CheckpointError(
-                    f"{path}: field sha256 does not agree with the content, which is altered: use another copy"
+                    f"{path}: field sha256 does not agree with the content, which is truncated or altered: "
+                    "use another copy"
                 )
             _check_kind(path, metadata, form)
             return metadata["header"], {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
@@ -95,8 +100,8 @@ def read_state(path: Path, form: StateFormat) -> tuple[dict[str, Any], dict[str,
         raise CheckpointError(f"{path}: can't be read ({error.strerror or error})") from error
     except (SafetensorError, TypeError, ValueError) as error:
         where = _damaged_entry(path)
-        what = f"field {where} is damaged" if where else "no state file of warpslam, truncated, or its table is damaged"
-        raise CheckpointError(f"{path}: {what} ({error}): use another copy") from None
+        what = f"field {where} is damaged" if where else "no state file of warpslam, or its table is damaged"
+        raise CheckpointError(f"{path}: {what}, truncated or altered ({error}): use another copy") from None
 
 
 def _native(array: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Occupancy of the coarse level (Eq. 1): no embedding, no position."""
+"""Occupancy of the coarse level (Eq. 4): no embedding, no position."""
 
 import warp as wp
 

@@ -1,4 +1,4 @@
-"""Colour (Eq. 4), its adjoint, and the gradient of its weights."""
+"""Colour (Eq. 5), its adjoint, and the gradient of its weights."""
 
 import warp as wp
 

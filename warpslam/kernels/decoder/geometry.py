@@ -1,4 +1,4 @@
-"""Occupancy of the middle and the fine level (Eq. 2-3), and the adjoint that both share."""
+"""Occupancy of the middle and the fine level (Eq. 1-3), and the adjoint that both share."""
 
 import warp as wp
 
