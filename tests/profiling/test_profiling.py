@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter, namedtuple
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +20,8 @@ from warpslam.errors import WarpSlamError
 from warpslam.field import passes
 from warpslam.field.arrays import Gradients, Thresholds
 from warpslam.field.passes import render
+from warpslam.kernels import adam, compositing, gauss_newton
+from warpslam.kernels import grid as grid_kernels
 from warpslam.kernels.decoder.build import decoders_for
 from warpslam.kernels.samples import Span
 from warpslam.profiling import costs, recorder
@@ -282,6 +286,35 @@ def test_what_cannot_be_counted_is_a_bound(frames):
     kernel = decoders_for(slam.device).middle_forward
     work = costs.work_of(kernel, False, 200, costs.Arguments(kernel, values, readable=False))
     assert (work.points, work.counted) == (800, False)
+
+
+@pytest.mark.parametrize("target", ["cpu", "cuda"])
+def test_every_model_finds_the_arguments_of_its_kernel(target):
+    """What a kernel with a model is launched with has the names that the model asks for, on CUDA as on the CPU."""
+    built = vars(decoders_for(SimpleNamespace(is_cuda=target == "cuda"))).values()
+    decoders = {kernel.key: kernel for kernel in built if isinstance(kernel, wp.Kernel)}
+    stages = (adam, compositing, gauss_newton, grid_kernels)
+    others = {name: kernel for stage in stages for name, kernel in vars(stage).items() if isinstance(kernel, wp.Kernel)}
+    known = {**others, **decoders}
+    modelled = [name for name in costs._MODELS if name in known]
+    assert len(modelled) > 12
+    for name in modelled:
+        values = [_stand_in(argument.type) for argument in known[name].adj.args]
+        work = costs.work_of(known[name], False, 64, costs.Arguments(known[name], values, readable=False))
+        assert work.points or work.bytes, name
+
+
+def _stand_in(kind: Any) -> Any:
+    """An argument of a kernel: a struct of its own, an array of one, or a number."""
+    if isinstance(kind, wp._src.codegen.Struct):
+        span = kind()
+        for field in ("point_count", "width", "sample_count"):
+            if field in kind.vars:
+                setattr(span, field, 8)
+        return span
+    if hasattr(kind, "ndim"):
+        return SimpleNamespace(shape=(1,) * kind.ndim)
+    return 8
 
 
 def test_device_times_go_to_the_phase_they_belong_to(monkeypatch):

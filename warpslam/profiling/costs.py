@@ -200,10 +200,8 @@ def _level_of(arguments: Arguments) -> str:
 
 
 def _sum_of_color_weights(threads: int, arguments: Arguments) -> Work:
-    points = arguments.number("point_count")
     shapes = decoder_shapes("color").items()
-    each = 2 * sum(math.prod(shape) for name, shape in shapes if name.endswith("weight"))
-    return Work(points, each * points, counted=False)
+    return _listed(2 * sum(math.prod(shape) for name, shape in shapes if name.endswith("weight")), threads, arguments)
 
 
 def _samples(name: str) -> Model:
