@@ -1,6 +1,6 @@
 """The strip on the first screen of README.md: a frame of a run, the map rendered at its pose, and the mesh from above.
 
-    python -m tools.readme_picture runs/house house --frame 40 --eye 4.4,-3.1,3.7 --target 6.7,1.5,0.75 --out strip.jpg
+    python -m tools.readme_picture runs/room room --frame 40 --eye 5.6,1.0,3.6 --target 1.6,5.2,0.8 --out strip.jpg
 
 The mesh is seen from ``--eye`` towards ``--target``, in the sequence's world, whose z is up. Faces that turn away from
 there are left out, so that a room is looked into from outside.
