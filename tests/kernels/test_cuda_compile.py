@@ -19,6 +19,7 @@ ARCHITECTURES = (80, 90)
 # Bytes that may be spilled, and why they are.
 SPILLING = {
     "color_backward": (16, "holds the gradients of two layers for the weights of the embedding"),
+    "fine_forward": (52, "on sm_80 alone, where 16 bytes of weights at a time lie beside the values of two levels"),
     "layer_weights": (1200, "of the baseline: sums eight rows of 32 at once"),
 }
 BUILT = ("warpslam.decoder_cuda", "warpslam.imap_cuda")
