@@ -251,7 +251,7 @@ def _composited_backward_by_ray(
     batch: RayBatch, stage: str, first: int, stop: int, slot: int, thresholds: Thresholds
 ) -> list[Step]:
     """Adjoint of compositing, and the list of the samples whose logit has a gradient."""
-    inputs = [first, steep_list(batch, first, slot), batch.rays, batch.keep, batch.rendered, int(stage == "color")]
+    inputs = [steep_list(batch, first, slot), batch.rays, batch.keep, batch.rendered, int(stage == "color")]
     inputs += [thresholds.min_weight, batch.depth.grad, batch.rgb.grad, batch.logit_grad, batch.color_grad]
     steep = steep_samples(batch, first, stop, slot, thresholds.min_gradient)
     return [(compositing.composite_backward, stop - first, inputs), steep]

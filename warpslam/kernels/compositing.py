@@ -270,7 +270,6 @@ def surface_depth(
 
 @wp.kernel(enable_backward=False)
 def composite_backward(
-    start: int,
     listed: Listed,
     rays: Rays,
     keep: wp.array[int],
@@ -283,7 +282,7 @@ def composite_backward(
     color_grad: wp.array[wp.vec3],
 ):
     """Also empties the list that `list_steep` fills next."""
-    tid = start + wp.tid()
+    tid = listed.start // rays.sample_count + wp.tid()
     if wp.tid() == 0:
         listed.counts[count_index(listed.slot)] = 0
     first = tid * rays.sample_count
