@@ -5,8 +5,10 @@ A pose ``T_world_camera`` maps camera points to world points [m]. A pose vector 
 
 from __future__ import annotations
 
+from functools import cache
+from typing import Any
+
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from warpslam.errors import InputError
 
@@ -42,7 +44,7 @@ def vector_from_pose(T: np.ndarray) -> np.ndarray:
     qw >= 0.
     """
     T = np.asarray(T, dtype=np.float64)
-    quaternion = Rotation.from_matrix(T[:3, :3]).as_quat(canonical=True, scalar_first=True)
+    quaternion = _rotation().from_matrix(T[:3, :3]).as_quat(canonical=True, scalar_first=True)
     return np.concatenate([quaternion, T[:3, 3]])
 
 
@@ -50,7 +52,7 @@ def pose_from_vector(vector: np.ndarray) -> np.ndarray:
     """Transform (4, 4), float64, of a pose vector (qw, qx, qy, qz, tx, ty, tz); the quaternion may have any length."""
     vector = np.asarray(vector, dtype=np.float64)
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(vector[:4], scalar_first=True).as_matrix()
+    T[:3, :3] = _rotation().from_quat(vector[:4], scalar_first=True).as_matrix()
     T[:3, 3] = vector[4:]
     return T
 
@@ -62,7 +64,7 @@ def transform_poses(T: np.ndarray, poses: np.ndarray) -> np.ndarray:
 
 def rotation_angles(R: np.ndarray) -> np.ndarray:
     """Angle [rad] of each rotation, R of shape (3, 3) or (N, 3, 3), accurate near 0 and near pi alike."""
-    return Rotation.from_matrix(R).magnitude()
+    return _rotation().from_matrix(R).magnitude()
 
 
 def motion_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -73,3 +75,11 @@ def motion_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """
     turn = rotation_angles(np.swapaxes(a[..., :3, :3], -1, -2) @ b[..., :3, :3])
     return np.stack([np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1), np.degrees(turn)], axis=-1)
+
+
+@cache
+def _rotation() -> Any:
+    """scipy's class of rotations: 30 MB that a program which only names frames or jobs does not need."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation
