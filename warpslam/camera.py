@@ -69,6 +69,42 @@ class Intrinsics:
         )
 
 
+MAX_DEPTH_DELAY = 0.2
+MAX_READOUT = 0.2
+
+
+@dataclass(frozen=True)
+class SensorTiming:
+    """When a camera sees what its images show; all 0 for images whose pixels are taken at one moment, as rendered ones
+    are.
+
+    The pose of a frame is that at the middle row of its colour image.
+    """
+
+    depth_delay: float = 0.0
+    """Time of depth minus that of colour [s], beyond the difference of their stamps: negative if depth is older."""
+    readout: float = 0.0
+    """Time from the first to the last row, of colour and depth alike [s]; 0 = global shutter."""
+
+    def __post_init__(self) -> None:
+        # "not <=" catches NaN.
+        if not abs(self.depth_delay) <= MAX_DEPTH_DELAY:
+            raise ConfigError(
+                f"camera.depth_delay = {self.depth_delay!r} must be -{MAX_DEPTH_DELAY} to {MAX_DEPTH_DELAY} seconds"
+            )
+        if not 0 <= self.readout <= MAX_READOUT:
+            raise ConfigError(f"camera.readout = {self.readout!r} must be 0 to {MAX_READOUT} seconds")
+
+    def depth_offset(self, timestamp: float, depth_timestamp: float | None) -> float:
+        """tau = t_depth - t_colour [s] of a frame with these stamps [s]; without a stamp of depth, the delay alone."""
+        stamped = 0.0 if depth_timestamp is None else depth_timestamp - timestamp
+        return stamped + self.depth_delay
+
+
+ONE_MOMENT = SensorTiming()
+"""All pixels of a frame are taken at once."""
+
+
 def check_number(value: float, name: str) -> float:
     """Return ``value`` as a float, NaN and infinity included, or raise `InputError`."""
     try:

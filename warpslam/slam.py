@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import ONE_MOMENT, Intrinsics, SensorTiming
 from warpslam.config import Config
 from warpslam.errors import InputError
 from warpslam.field.complexity import field_flops, weight_count
@@ -60,6 +60,7 @@ class Slam:
         seed: Of the initial features and of every random choice. Same input, seed and number of CPU cores: same result
             on the CPU (with the strict schedule).
         decoders: Decoder weights; by default those of `Config.decoders`, and failing that the package's own.
+        timing: When the camera's pixels are taken; `Config.sensor_timing` off = all at once.
     """
 
     has_checkpoints: ClassVar[bool] = True
@@ -72,11 +73,13 @@ class Slam:
         seed: int = 0,
         *,
         decoders: Decoders | None = None,
+        timing: SensorTiming = ONE_MOMENT,
     ) -> None:
         self.intrinsics = intrinsics
         self.config = (config if config is not None else Config()).resolved()
         check_settings(intrinsics, self.config)
         check_window_fits(intrinsics, self.config.keyframes.max_gigabytes, self.config.mapping.window)
+        self.timing = timing
         self.device = wp.get_device(device)
         self.seed = seed
         start = time.perf_counter()
@@ -104,6 +107,7 @@ class Slam:
         T_world_camera: np.ndarray | None = None,
         *,
         depth_scale: float | None = None,
+        depth_timestamp: float | None = None,
     ) -> FrameResult:
         """Take in one frame.
 
@@ -116,17 +120,18 @@ class Slam:
                 `forget_pose`, and for every frame with `TrackingConfig.use_given_poses`. One that is not finite counts
                 as unknown.
             depth_scale: Units per metre of integer depth, for example 1000 or 5000.
+            depth_timestamp: Time of the depth image [s], where it has one of its own; ``timestamp`` is colour's.
 
         A bad frame raises nothing: arrays of another size or type, too few pixels with depth, a black or over-exposed
-        image, a time that is not finite, or a pose that is not finite where one is needed give the status SKIPPED and
-        a message, and leave the map as it was.
+        image, a time that is not finite, depth stamped more than half a second from colour, or a pose that is not
+        finite where one is needed give the status SKIPPED and a message, and leave the map as it was.
 
         Raises:
             InputError: Misuse, which no other frame would mend: an argument that is no array, integer depth without
                 ``depth_scale``, a T_world_camera that is no rigid transform, or none where one is needed.
             MapSizeError: The map would outgrow the memory set for it.
         """
-        frame = self._admit(rgb, depth, timestamp, T_world_camera, depth_scale)
+        frame = self._admit(rgb, depth, timestamp, T_world_camera, depth_scale, depth_timestamp)
         if frame.fault:
             self.history.skip(frame.timestamp)
             return skipped(frame, self.history.last_pose)
@@ -192,7 +197,13 @@ class Slam:
     # -- its steps -----------------------------------------------------------------------------------------------
 
     def _admit(
-        self, rgb: Any, depth: Any, timestamp: float | None, pose: np.ndarray | None, depth_scale: float | None
+        self,
+        rgb: Any,
+        depth: Any,
+        timestamp: float | None,
+        pose: np.ndarray | None,
+        depth_scale: float | None,
+        depth_timestamp: float | None,
     ) -> AdmittedFrame:
         config = self.config
         return admit(
@@ -205,6 +216,8 @@ class Slam:
             last_timestamp=self.history.last_timestamp,
             intrinsics=self.intrinsics,
             config=config,
+            depth_timestamp=depth_timestamp if config.sensor_timing else None,
+            timing=self._timing,
             colored=config.tracking.color_weight > 0 or config.mapping.color_weight > 0,
         )
 
@@ -293,6 +306,11 @@ class Slam:
     # -- what came out -------------------------------------------------------------------------------------------
 
     @property
+    def _timing(self) -> SensorTiming:
+        """As it is corrected for."""
+        return self.timing if self.config.sensor_timing else ONE_MOMENT
+
+    @property
     def trajectory(self) -> Trajectory:
         """All poses so far; keyframes and mapped frames with the corrections of bundle adjustment."""
         return self.history.trajectory
@@ -370,6 +388,7 @@ class Slam:
         *,
         config: Config | None = None,
         localize_only: bool = False,
+        timing: SensorTiming | None = None,
     ) -> Slam:
         """Read what `save` wrote; the result goes on from the last frame.
 
@@ -379,12 +398,14 @@ class Slam:
             config: Settings from now on, those saved by default; the grids' spacings are the map's.
             localize_only: The map stays as it is, and the camera may be anywhere in it: `mapping.enabled` is off, and
                 `forget_pose` was called.
+            timing: Of the frames to come, if it is not that of the frames before.
 
         Raises:
             CheckpointError: The file is missing, damaged, or of another version.
             ConfigError: ``config`` does not fit the map.
         """
         slam = cls.from_state(read_slam(Path(path), config), device, localize_only=localize_only)
+        slam.timing = slam.timing if timing is None else timing
         if localize_only:
             slam.forget_pose()
         return slam
@@ -395,6 +416,7 @@ class Slam:
         return SlamState(
             config=self.config,
             intrinsics=self.intrinsics,
+            timing=self.timing,
             seed=self.seed,
             device=self.device,
             history=self.history.state(),
@@ -417,7 +439,7 @@ class Slam:
         """
         config = state.config.model_copy(deep=True)
         config.mapping.enabled &= not localize_only
-        slam = cls(state.intrinsics, config, device, state.seed, decoders=state.scene.decoders)
+        slam = cls(state.intrinsics, config, device, state.seed, decoders=state.scene.decoders, timing=state.timing)
         slam.history = FrameHistory.restored(state.history)
         slam.scene.restore(state.scene)
         slam.images.restore(state.current_image, [image for _, image in state.keyframes])

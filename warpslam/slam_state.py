@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import Intrinsics, SensorTiming
 from warpslam.config import Config
 from warpslam.errors import ConfigError, InputError
 from warpslam.field.decoders import LEVELS, Decoders, DecoderWeights, expected_shapes
@@ -25,7 +25,7 @@ from warpslam.scene.scene_map import SceneState
 from warpslam.storage.state_file import StateFields, StateFormat, read_state, write_state
 from warpslam.trajectory import HistoryState
 
-MAP_FORMAT = StateFormat("warpslam-map", 5, "the map of a run with --method nice-slam")
+MAP_FORMAT = StateFormat("warpslam-map", 6, "the map of a run with --method nice-slam")
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,8 @@ class SlamState:
     """Settings."""
     intrinsics: Intrinsics
     """Camera."""
+    timing: SensorTiming
+    """When its pixels are taken."""
     seed: int
     """Of every random choice."""
     device: wp.Device
@@ -97,6 +99,7 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
         "slices": slice_count(state.device),
         "config": state.config.model_dump(),
         "intrinsics": vars(state.intrinsics),
+        "timing": vars(state.timing),
         "current": state.current,
         "mapped": state.mapped,
         "first": state.history.first,
@@ -155,6 +158,7 @@ def state_from_arrays(
         check_settings(camera, config)
     except (TypeError, ConfigError, InputError) as error:
         raise fields.damaged("intrinsics", error) from None
+    timing = fields.parsed("timing", lambda values: SensorTiming(**values))
     history = HistoryState.read(fields)
     count = len(history.poses)
     size = (camera.height, camera.width)
@@ -171,6 +175,7 @@ def state_from_arrays(
     return SlamState(
         config=config,
         intrinsics=camera,
+        timing=timing,
         seed=fields.integer("seed"),
         device=wp.get_device("cpu"),
         history=history,

@@ -74,11 +74,17 @@ def _run(sequence: RgbdSequence, config: Config, selected: range, options: argpa
     with Profile() as result:
         with phase("setup"):
             load_kernels(sequence, options.device)
-            slam = build_slam(sequence.intrinsics, config, options.device, options.seed)
+            slam = build_slam(sequence.intrinsics, config, options.device, options.seed, timing=sequence.timing)
         for index in selected:
             with phase("reading"):
                 frame = sequence[index]
-            slam.step(frame.rgb, frame.depth, frame.timestamp, frame.T_world_camera)
+            slam.step(
+                frame.rgb,
+                frame.depth,
+                frame.timestamp,
+                frame.T_world_camera,
+                depth_timestamp=frame.depth_timestamp,
+            )
         slam.finish()
         if not options.no_mesh:
             try:

@@ -297,6 +297,11 @@ class Config(_Group):
         description="strict: mapping after tracking, runs repeat to the bit; overlapped: beside it, and the map is at "
         "most one mapping interval behind",
     )
+    sensor_timing: bool = Field(
+        True,
+        description="depth that is taken before or after colour, and rows that are taken one after the other, are "
+        "corrected for where stamps or the camera tell; off = every pixel is taken at once (paper)",
+    )
     decoders: str | None = Field(None, description="decoder checkpoint; the package's own when empty")
 
     @classmethod

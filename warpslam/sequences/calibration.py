@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import ONE_MOMENT, Intrinsics, SensorTiming
 from warpslam.errors import ConfigError, DatasetError
 
 CAMERA_FIELDS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale")
 CAMERA_FILE = "camera.yaml"
 _MAX_SIZE = 16384  # [pixels], what OpenCV warps without trouble
-_OPTIONAL_FIELDS = ("distortion", "resize", "crop")
+_OPTIONAL_FIELDS = ("distortion", "resize", "crop", "depth_delay", "readout")
 _DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 
 
@@ -32,6 +32,8 @@ class Calibration:
     """Size (width, height) to which frames are resized first; None = as stored."""
     crop: int = 0
     """Border [pixels] cut from every side after resizing."""
+    stored_timing: SensorTiming = ONE_MOMENT
+    """When the pixels of the stored images are taken."""
     source: str = "camera"
     """Where the numbers come from, for messages."""
 
@@ -41,9 +43,31 @@ class Calibration:
         resized = self.stored if self.resize is None else self.stored.scaled(*self.resize)
         return resized.cropped(self.crop) if self.crop else resized
 
+    @property
+    def timing(self) -> SensorTiming:
+        """When the pixels of the frames as returned are taken: rows that are cut off are not read by them."""
+        rows = self.intrinsics.height
+        return replace(self.stored_timing, readout=self.stored_timing.readout * rows / (rows + 2 * self.crop))
+
+    def to_yaml(self) -> str:
+        """The text of a ``camera.yaml`` that `from_yaml` reads back; fields at their defaults are left out."""
+        import yaml
+
+        fields: dict[str, Any] = {**asdict(self.stored), "depth_scale": self.depth_scale}
+        if self.distortion:
+            fields["distortion"] = list(self.distortion)
+        if self.resize is not None:
+            fields["resize"] = list(self.resize)
+        if self.crop:
+            fields["crop"] = self.crop
+        fields |= {name: value for name, value in asdict(self.stored_timing).items() if value}
+        return yaml.safe_dump(fields, sort_keys=False, default_flow_style=None)
+
     @classmethod
     def from_fields(cls, fields: dict[str, Any], source: str) -> Calibration:
-        """Check and convert a mapping with `CAMERA_FIELDS` and, where wanted, distortion, resize, crop."""
+        """Check and convert a mapping with `CAMERA_FIELDS` and, where wanted, distortion, resize, crop, depth_delay and
+        readout [s].
+        """
         unknown = sorted(set(map(str, fields)) - set(CAMERA_FIELDS) - set(_OPTIONAL_FIELDS))
         if unknown:
             known = ", ".join(CAMERA_FIELDS + _OPTIONAL_FIELDS)
@@ -79,9 +103,10 @@ class Calibration:
         crop = _whole(_number(fields.get("crop") or 0, "crop", source), "crop", source)
         if crop < 0:
             raise DatasetError(f"{source}: crop = {crop} must be 0 or more pixels")
+        seconds = {name: _number(fields.get(name) or 0.0, name, source) for name in ("depth_delay", "readout")}
         try:
             stored = Intrinsics(**values, width=width, height=height)
-            calibration = cls(stored, depth_scale, distortion, resize, crop, source)
+            calibration = cls(stored, depth_scale, distortion, resize, crop, SensorTiming(**seconds), source)
             # A crop larger than the image shows here.
             _ = calibration.intrinsics
         except ConfigError as error:

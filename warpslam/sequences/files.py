@@ -29,6 +29,7 @@ class FileSequence(RgbdSequence):
         depth_files: Depth images, as many.
         poses: Camera-to-world transforms, OpenCV axes, shape (N, 4, 4), NaN where unknown, or None.
         timestamps: Times [s], shape (N,); index / 30 if None.
+        depth_timestamps: Times of the depth images [s], shape (N,), where they have their own.
         color_size_may_differ: Resize colour to the size of the depth image instead of refusing another size.
         remarks: What was left out in making the list of frames, for `warpslam check`.
 
@@ -45,6 +46,7 @@ class FileSequence(RgbdSequence):
         *,
         poses: np.ndarray | None = None,
         timestamps: np.ndarray | None = None,
+        depth_timestamps: np.ndarray | None = None,
         color_size_may_differ: bool = False,
         remarks: Sequence[str] = (),
     ) -> None:
@@ -62,8 +64,9 @@ class FileSequence(RgbdSequence):
             )
         self.name = folder.resolve().name
         self.calibration = calibration
-        self.intrinsics = calibration.intrinsics
+        self.intrinsics, self.timing = calibration.intrinsics, calibration.timing
         self.timestamps = np.arange(len(rgb_files)) / FRAME_RATE if timestamps is None else timestamps
+        self.depth_timestamps = depth_timestamps
         self._rgb_files, self._depth_files = list(rgb_files), list(depth_files)
         self._poses = None if poses is None or np.isnan(poses).all() else poses
         self._color_size_may_differ = color_size_may_differ
@@ -82,7 +85,8 @@ class FileSequence(RgbdSequence):
         pose = None
         if self._poses is not None and np.isfinite(self._poses[index]).all():
             pose = self._poses[index].copy()
-        return Frame(index, float(self.timestamps[index]), rgb, depth, pose)
+        depth_time = None if self.depth_timestamps is None else float(self.depth_timestamps[index])
+        return Frame(index, float(self.timestamps[index]), rgb, depth, pose, depth_time)
 
     def ground_truth(self) -> np.ndarray | None:
         """All poses, float64, shape (N, 4, 4), NaN where unknown; None if the sequence has none."""
