@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -65,6 +65,8 @@ class Attempt:
     grey_scale: float
     """Spread of the photometric residuals [grey values]."""
     ok: bool = True
+    moved: float = 0.0
+    """How far the image moved from the start [px of the middle level]."""
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,7 @@ class DirectTracker:
         self._overlap: dict[int, float] = {}  # with the last frame, by keyframe
         self._reference = 0
         self._typical_scale = np.inf
+        self._typical_cost = np.inf
         self._before: tuple[int, np.ndarray, np.ndarray] | None = None  # frame and images of the last that was OK
         self._rotations = rotation_grid(config.search_span)
         self.counts = {"sure": 0, "searched": 0}
@@ -154,6 +157,9 @@ class DirectTracker:
             attempt.grey_scale
             if not np.isfinite(self._typical_scale)
             else 0.9 * self._typical_scale + 0.1 * attempt.grey_scale
+        )
+        self._typical_cost = (
+            attempt.cost if not np.isfinite(self._typical_cost) else 0.9 * self._typical_cost + 0.1 * attempt.cost
         )
         self._reference = attempt.keyframe
         reference = self.keyframes[attempt.keyframe]
@@ -218,10 +224,10 @@ class DirectTracker:
         W = self.keyframes[reference].pose
         task = self._task()
         task["keyframe"], task["row"], task["top"], task["low"] = self._points_of(reference), row, self.plan.middle, 0
-        task["cost_level"] = self.judged
+        task["cost_level"] = 0
         task["T"] = inverse(start) @ W
         if best is not None:
-            task["top"], task["exposure"], task["T"] = self.judged, best.exposure, best.T_frame_keyframe
+            task["top"], task["exposure"], task["T"] = 0, best.exposure, best.T_frame_keyframe
         started = self.registrar.start(task)
         wanted = [k for k, share in sorted(self._overlap.items(), key=lambda item: -item[1]) if share > MIN_OVERLAP]
         joined = [reference, *[k for k in wanted if k != reference]][: max(self.config.joint, 1)]
@@ -242,7 +248,7 @@ class DirectTracker:
         )
         result, last = started.numpy()[0], final.numpy()[0]
         self._overlap = dict(zip(near, shares.numpy()[: len(near)].tolist(), strict=True))
-        attempt = self._attempt(reference, result)
+        attempt = replace(self._attempt(reference, result), moved=self._shift(row, task[0]["T"], result["T"]))
         if best is not None:
             attempt = Attempt(reference, attempt.T_frame_keyframe, attempt.exposure, best.cost, best.measures, best.grey_scale, attempt.ok)
         T, T_joint = (np.asarray(one["T"], np.float64) for one in (result, last))
@@ -251,6 +257,12 @@ class DirectTracker:
             T_joint = T
         self._seen = Measures.of(result["record_0"])
         return attempt, T_joint, np.asarray(last["H"], np.float64)
+
+    def _shift(self, row: int, a: np.ndarray, b: np.ndarray) -> float:
+        """How far two transforms put points apart, about [px of the middle level]."""
+        step, turn = motion_between(np.asarray(a, np.float64), np.asarray(b, np.float64))
+        focal = float(self.plan.levels[self.plan.middle]["fx"])
+        return float(focal * (step / self.registrar.mean_depth(row) + np.radians(turn)))
 
     def _attempt(self, keyframe: int, result: np.ndarray) -> Attempt:
         record = result["record_1"] if self.judged == 1 else result["record_0"]
@@ -275,6 +287,8 @@ class DirectTracker:
             and m.view > 0.4
             and m.known > 0.2
             and attempt.grey_scale < limit
+            and attempt.cost < max(config.sure_cost * self._typical_cost, 0.5)
+            and attempt.moved < config.sure_shift
         )
 
     def _is_good(self, attempt: Attempt) -> bool:
@@ -355,7 +369,7 @@ class DirectTracker:
     ) -> Attempt | None:
         """The cheapest of many starts: each as it is and after the smallest levels, the best three refined."""
         W = self.keyframes[keyframe].pose
-        top, middle, low = self.plan.top, self.plan.middle, self.judged
+        top, middle = self.plan.top, self.plan.middle
         tasks = self._task(len(poses))
         tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, middle
         tasks["top"], tasks["low"], tasks["iterations"] = top, max(top - 1, 0), 6
@@ -377,8 +391,8 @@ class DirectTracker:
             if len(chosen) == 3:
                 break
         tasks = self._task(len(chosen))
-        tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, low
-        tasks["top"], tasks["low"] = middle, low
+        tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, 0
+        tasks["top"], tasks["low"] = middle, 0
         for task, (_, T, exposure) in zip(tasks, chosen, strict=True):
             task["T"], task["exposure"] = T, exposure
         for result in self.registrar.register(tasks):
