@@ -77,6 +77,43 @@ class _Anchor:
     T_keyframe_frame: np.ndarray
 
 
+@dataclass(frozen=True)
+class _Before:
+    """The last frame that was OK, as it may yet become a keyframe."""
+
+    index: int
+    rgb: np.ndarray
+    depth: np.ndarray
+    kept: tuple[np.ndarray, np.ndarray, float] | None
+    """Its images as the pool held them; None where they are on a GPU."""
+
+
+@dataclass(frozen=True)
+class DirectState:
+    """All that the next frame depends on beside poses and images, for N frames."""
+
+    anchors: np.ndarray
+    """Keyframe that a frame hangs on, -1 = none, int64 (N,)."""
+    relative: np.ndarray
+    """T_keyframe_frame, float64 (N, 4, 4)."""
+    offsets: np.ndarray
+    """Time of depth minus that of colour [s], float64 (N,)."""
+    twists: np.ndarray
+    """Motion of the camera while it took the frame [m/s, rad/s], float64 (N, 6); NaN = not known."""
+    overlap: np.ndarray
+    """Share of each keyframe that the last frame sees, float64 (keyframes,); NaN = not looked at."""
+    reference: int
+    """Keyframe that frames are registered to."""
+    before: int
+    """The last frame that was OK, -1 = none."""
+    typical: tuple[float, float]
+    """Running means of the photometric scale and of the cost; infinite = none yet."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Those that are arrays, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+
+
 class DirectTracker:
     """Finds the pose of the frame in slot 0 of the image pool, and makes keyframes.
 
@@ -114,7 +151,7 @@ class DirectTracker:
         self._reference = 0
         self._typical_scale = np.inf
         self._typical_cost = np.inf
-        self._before: tuple[int, np.ndarray, np.ndarray] | None = None  # frame and images of the last that was OK
+        self._before: _Before | None = None
         self._rotations = rotation_grid(config.search_span)
         self.counts = {"sure": 0, "searched": 0}
 
@@ -122,18 +159,19 @@ class DirectTracker:
 
     def place(self, frame: AdmittedFrame, pose: np.ndarray) -> None:
         """A frame whose pose is given; it becomes a keyframe."""
+        self._build_missing()
         self._load(frame)
-        self._settle(frame, None)
-        self._add_keyframe(frame.index, pose, frame.rgb, frame.depth)
+        self._add_keyframe(frame.index, pose, self.images.keep_current())
+        self._note(frame)
 
     def locate(self, frame: AdmittedFrame, history: FrameHistory) -> Located:
         """Pose of the frame, which comes after the frames of ``history``."""
+        self._build_missing()
         row = self._load(frame)
         self._foretell_motion(row, frame, history)
         starts = history.starts(constant_speed=True)
-        if not self.keyframes or (not starts and not history.was_known):
-            if not self.keyframes:
-                return Located(np.eye(4), "there is no keyframe to compare with")
+        if not self.keyframes:
+            return Located(np.eye(4), "it is not known where the camera starts: there is no keyframe to compare with")
         best: Attempt | None = None
         done: tuple[Attempt, np.ndarray, np.ndarray] | None = None
         if history.was_known:
@@ -183,7 +221,7 @@ class DirectTracker:
             if old is not None:
                 self._reference = old
             else:
-                self._add_keyframe(frame.index, pose, frame.rgb, frame.depth)
+                self._add_keyframe(frame.index, pose, self.images.keep_current())
                 self._refine(history)
                 located = Located(
                     self.keyframes[-1].pose.copy(),
@@ -320,7 +358,7 @@ class DirectTracker:
             best = _better(best, found, by_cost=True)
             if best is not None and self._is_good(best):
                 return best
-            if history.was_known and self._before is not None and self._before[0] != self._reference_frame:
+            if history.was_known and self._before is not None and self._before.index != self._reference_frame:
                 self._keep_before(history)
                 found = self._search(row, self._points_of(self._reference), self._reference, poses, None)
                 best = _better(best, found)
@@ -330,10 +368,8 @@ class DirectTracker:
 
     def _turned(self, row: int, starts: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Starts whose rotation was found on the smallest images of the frame before."""
-        if self._before is None or not starts:
-            return []
-        before = self._row_of.get(self._before[0])
-        if before is None:
+        before = self._row_before()
+        if before is None or not starts:
             return []
         rotations = self._best_rotations(self.registrar.smallest(before)[None], row, self.config.search_kept)[0]
         last = starts[-1]
@@ -470,28 +506,43 @@ class DirectTracker:
         far = 0.8 * config.keyframe_step * self.registrar.mean_depth(row)
         return best[0] if step < far and turn < 0.8 * config.keyframe_turn else None
 
-    def _add_keyframe(self, index: int, pose: np.ndarray, rgb: np.ndarray, depth: np.ndarray) -> int:
-        """Make a frame whose images are loaded a keyframe, and the reference; its number."""
+    def _add_keyframe(self, index: int, pose: np.ndarray, image: int) -> None:
+        """Make a frame whose pyramid is built a keyframe, and the reference; ``image``: its number in the pool."""
         number = len(self.keyframes)
-        row = self._row_of[index]
-        self.registrar.select(row, self._points_of(number))
-        self.keyframes.append(Keyframe(index, self.images.add(rgb, depth), orthonormalized(pose)))
-        self._smallest.append(self.registrar.smallest(row))
-        self._mean_depth.append(self.registrar.mean_depth(row))
+        self.keyframes.append(Keyframe(index, image, orthonormalized(pose)))
+        self._take_up(number)
         self._anchors[index] = _Anchor(number, np.eye(4))
         self._overlap[number] = 1.0
         self._reference = number
-        return number
+
+    def _take_up(self, number: int) -> None:
+        """Choose the points of a keyframe."""
+        row = self._row(self.keyframes[number])
+        self.registrar.select(row, self._points_of(number))
+        self._smallest.append(self.registrar.smallest(row))
+        self._mean_depth.append(self.registrar.mean_depth(row))
+
+    def _build_missing(self) -> None:
+        """Take up keyframes that came from elsewhere: a file, or frames whose poses were given."""
+        for number in range(len(self._smallest), len(self.keyframes)):
+            self._take_up(number)
 
     def _keep_before(self, history: FrameHistory) -> None:
         """The last frame that was OK becomes a keyframe: it is what a lost camera is nearest to."""
+        before = self._before
+        if before is None or self._row_before() is None or before.index in (one.index for one in self.keyframes):
+            return
+        image = self.images.add(before.rgb, before.depth) if before.kept is None else self.images.add_kept(*before.kept)
+        self._add_keyframe(before.index, history.pose(before.index), image)
+
+    def _row_before(self) -> int | None:
+        """Where the images of the last frame that was OK are; None if they are gone."""
         if self._before is None:
-            return
-        index, rgb, depth = self._before
-        anchor = self._anchors[index]
-        if anchor is None or self.keyframes[anchor.keyframe].index == index or index not in self._row_of:
-            return
-        self._add_keyframe(index, history.pose(index), rgb, depth)
+            return None
+        index = self._before.index
+        if index in self._row_of:
+            return self._row_of[index]
+        return next((self._row(one) for one in reversed(self.keyframes) if one.index == index), None)
 
     def _refine(self, history: FrameHistory) -> None:
         """Refine the keyframes around the newest, and move the frames that hang on them."""
@@ -556,7 +607,7 @@ class DirectTracker:
         self._offsets[frame.index] = frame.depth_offset
         row = self._take_row(frame.index)
         rgb, depth, scale = self.images.arrays
-        self.registrar.load(row, rgb[0], depth[0], scale)
+        self.registrar.load(row, rgb[0], depth[0], scale[:1])
         while len(self._anchors) <= frame.index:
             self._anchors.append(None)
         return row
@@ -594,7 +645,47 @@ class DirectTracker:
         self._anchors[frame.index] = anchor
 
     def _note(self, frame: AdmittedFrame) -> None:
-        self._before = frame.index, frame.rgb.copy(), frame.depth.copy()
+        kept = self.images.current() if self.device.is_cpu else None
+        self._before = _Before(frame.index, frame.rgb if kept else frame.rgb.copy(), frame.depth, kept)
+
+    # -- saved ---------------------------------------------------------------------------------------------------
+
+    def state(self) -> DirectState:
+        """All of it as arrays."""
+        count = len(self._anchors)
+        anchors = [-1 if anchor is None else anchor.keyframe for anchor in self._anchors]
+        relative = [np.eye(4) if anchor is None else anchor.T_keyframe_frame for anchor in self._anchors]
+        unknown = np.full(6, np.nan)
+        return DirectState(
+            anchors=np.array(anchors, np.int64),
+            relative=np.array(relative, np.float64).reshape(-1, 4, 4),
+            offsets=np.array([self._offsets.get(n, 0.0) for n in range(count)], np.float64),
+            twists=np.array([self._twists.get(n, unknown) for n in range(count)], np.float64).reshape(-1, 6),
+            overlap=np.array([self._overlap.get(k, np.nan) for k in range(len(self.keyframes))], np.float64),
+            reference=self._reference,
+            before=-1 if self._before is None else self._before.index,
+            typical=(self._typical_scale, self._typical_cost),
+        )
+
+    def restore(self, state: DirectState, current: int | None) -> None:
+        """Go on from what `state` returned; keyframes and images are restored already, ``current`` is in slot 0."""
+        pairs = zip(state.anchors.tolist(), state.relative, strict=True)
+        self._anchors = [None if k < 0 else _Anchor(k, T.copy()) for k, T in pairs]
+        self._offsets = dict(enumerate(state.offsets.tolist()))
+        self._twists = {n: twist.copy() for n, twist in enumerate(state.twists) if np.isfinite(twist).all()}
+        self._overlap = {k: share for k, share in enumerate(state.overlap.tolist()) if np.isfinite(share)}
+        self._reference = state.reference
+        self._typical_scale, self._typical_cost = state.typical
+        if state.before >= 0:
+            rgb, units, scale = self.images.current()
+            depth = units.astype(np.float32) * np.float32(scale)
+            self._before = _Before(state.before, rgb, depth, (rgb, units, scale))
+            if state.before == current:
+                row = self._take_row(state.before)
+                device_rgb, device_depth, device_scale = self.images.arrays
+                self.registrar.load(row, device_rgb[0], device_depth[0], device_scale[:1])
+                if state.before in self._twists:
+                    self._set_motion(row, state.before, self._twists[state.before])
 
     # -- motion within a frame -----------------------------------------------------------------------------------
 
