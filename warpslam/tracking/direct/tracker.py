@@ -1,0 +1,616 @@
+"""The camera by direct registration against keyframes: which starts, which keyframes, and when a pose is believed.
+
+A frame is registered to the reference keyframe from where constant speed foretells it. If the outcome is beyond doubt,
+that is all; if not, the exhaustive search goes over rotations of the smallest images, over the motions that depth leaves
+open and over zero motion, then to the frame before, then to older keyframes. An accepted pose is registered to the
+keyframes of largest overlap at once. A frame that sees much else becomes a keyframe, and the keyframes around it are
+refined together (`warpslam.tracking.direct.window`); frames hang on their keyframe and follow it.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warpslam.camera import Intrinsics
+from warpslam.config import DirectConfig
+from warpslam.frames import AdmittedFrame
+from warpslam.kernels.direct import equations as eq
+from warpslam.kernels.direct import points, registration
+from warpslam.poses import inverse, motion_between, motion_of, orthonormalized, twist_of
+from warpslam.scene.image_pool import ImagePool
+from warpslam.scene.keyframes import Keyframe
+from warpslam.tracking.direct.measures import Measures
+from warpslam.tracking.direct.pyramid import PyramidPlan
+from warpslam.tracking.direct.registrar import Floors, Registrar, new_tasks
+from warpslam.tracking.direct.window import Pose, refine_window
+from warpslam.trajectory import FrameHistory, Located
+
+RECENT = 4
+"""Rows of images for frames that are no keyframes (yet)."""
+CACHED = 24
+"""Rows of images of keyframes; those of others are built anew when they are wanted."""
+MIN_OVERLAP = 0.35
+"""Of a keyframe in the joint registration."""
+NEAR_KEYFRAMES = 24
+"""Keyframes, the nearest by pose, whose overlap is looked at."""
+DEGREE = 0.02
+"""Metres that a degree counts for when keyframes are ordered by nearness."""
+MAX_JOINT_STEP, MAX_JOINT_TURN = 0.1, 5.0
+"""Further than this [m], [degrees] the joint registration must not take a pose."""
+SCRATCH = 0
+"""Row of points that hold no keyframe's."""
+TWIST_STEPS = 2
+"""Frames back to where the camera's velocity is taken from: over one, an error of a pose feeds back into the next."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A frame registered to a keyframe."""
+
+    keyframe: int
+    """Number of the keyframe, or `BEFORE` for the frame before."""
+    T_frame_keyframe: np.ndarray
+    """float64 (4, 4)."""
+    exposure: np.ndarray
+    """Gain and bias (2,)."""
+    cost: float
+    """Mean robust cost, by which attempts are compared."""
+    measures: Measures
+    """At the level where poses are judged."""
+    grey_scale: float
+    """Spread of the photometric residuals [grey values]."""
+    ok: bool = True
+
+
+@dataclass(frozen=True)
+class _Anchor:
+    """The keyframe that a frame hangs on."""
+
+    keyframe: int
+    T_keyframe_frame: np.ndarray
+
+
+class DirectTracker:
+    """Finds the pose of the frame in slot 0 of the image pool, and makes keyframes.
+
+    Args:
+        camera: Camera of all frames.
+        config: Settings.
+        max_depth: Depth beyond this is not used [m].
+        device: Where it computes.
+        keyframes: The list that keyframes are added to.
+        images: Where their images are kept.
+    """
+
+    def __init__(
+        self,
+        camera: Intrinsics,
+        config: DirectConfig,
+        max_depth: float,
+        device: wp.Device,
+        keyframes: list[Keyframe],
+        images: ImagePool,
+        readout: float = 0.0,
+    ) -> None:
+        self.camera, self.config, self.device = camera, config, device
+        self.keyframes, self.images, self.readout = keyframes, images, readout
+        self.plan = PyramidPlan.of(camera)
+        floors = Floors(config.grey_floor, config.depth_floor)
+        self.registrar = Registrar(self.plan, RECENT + CACHED, max_depth, floors, device)
+        self._row_of: OrderedDict[int, int] = OrderedDict()  # by frame, the one used longest ago first
+        self._anchors: list[_Anchor | None] = []
+        self._smallest: list[np.ndarray] = []
+        self._mean_depth: list[float] = []
+        self._overlap: dict[int, float] = {}  # with the last frame, by keyframe
+        self._reference = 0
+        self._typical_scale = np.inf
+        self._before: tuple[int, np.ndarray, np.ndarray] | None = None  # frame and images of the last that was OK
+        self._rotations = rotation_grid(config.search_span)
+        self.counts = {"sure": 0, "searched": 0}
+
+    # -- what Slam asks ------------------------------------------------------------------------------------------
+
+    def place(self, frame: AdmittedFrame, pose: np.ndarray) -> None:
+        """A frame whose pose is given; it becomes a keyframe."""
+        self._load(frame)
+        self._settle(frame, None)
+        self._add_keyframe(frame.index, pose, frame.rgb, frame.depth)
+
+    def locate(self, frame: AdmittedFrame, history: FrameHistory) -> Located:
+        """Pose of the frame, which comes after the frames of ``history``."""
+        row = self._load(frame)
+        self._set_motion(row, frame, history, None)
+        starts = history.starts(constant_speed=True)
+        if not self.keyframes or (not starts and not history.was_known):
+            if not self.keyframes:
+                return Located(np.eye(4), "there is no keyframe to compare with")
+        best: Attempt | None = None
+        done: tuple[Attempt, np.ndarray, np.ndarray] | None = None
+        if history.was_known:
+            done = self._follow(row, self._reference, starts[0], frame, history)
+            if self._is_sure(done[0]):
+                self.counts["sure"] += 1
+            else:
+                best, done = done[0], None
+        if done is None:
+            self.counts["searched"] += 1
+            best = self._look_everywhere(row, frame, history, starts, best)
+            if best is None or not self._is_good(best):
+                self._settle(frame, None)
+                self._keep_before(history)
+                return Located(history.last_pose, _why_lost(best), not history.was_known)
+            pose = self._pose_of(best)
+            self._overlap = self._overlaps_at(row, pose)
+            done = self._follow(row, best.keyframe, pose, frame, history, best)
+        attempt, T_frame_reference, H = done
+        self._typical_scale = (
+            attempt.grey_scale
+            if not np.isfinite(self._typical_scale)
+            else 0.9 * self._typical_scale + 0.1 * attempt.grey_scale
+        )
+        self._reference = attempt.keyframe
+        reference = self.keyframes[attempt.keyframe]
+        pose = orthonormalized(reference.pose @ inverse(T_frame_reference))
+        self._settle(frame, _Anchor(attempt.keyframe, inverse(reference.pose) @ pose))
+        after_loss = not history.was_known
+        measures = attempt.measures
+        located = Located(
+            pose,
+            after_loss=after_loss,
+            inliers=measures.agreement,
+            loss=attempt.cost,
+        )
+        self._note(frame)
+        if self._is_new(row, pose, attempt):
+            old = self._revisited(row, pose, attempt.keyframe)
+            if old is not None:
+                self._reference = old
+            else:
+                self._add_keyframe(frame.index, pose, frame.rgb, frame.depth)
+                self._refine(history)
+                located = Located(
+                    self.keyframes[-1].pose.copy(),
+                    after_loss=after_loss,
+                    inliers=measures.agreement,
+                    loss=attempt.cost,
+                )
+        return located
+
+    # -- registration --------------------------------------------------------------------------------------------
+
+    @property
+    def judged(self) -> int:
+        """The level where poses are judged."""
+        return min(1, self.plan.top)
+
+    def _task(self, count: int = 1) -> np.ndarray:
+        tasks = new_tasks(count)
+        tasks["grey"], tasks["depth"] = self.config.grey_weight, self.config.depth_weight
+        return tasks
+
+    def _follow(
+        self,
+        row: int,
+        reference: int,
+        start: np.ndarray,
+        frame: AdmittedFrame,
+        history: FrameHistory,
+        best: Attempt | None = None,
+    ) -> tuple[Attempt, np.ndarray, np.ndarray]:
+        """Register to the reference from a pose, then to all keyframes of large overlap; one reading of the device.
+
+        best: What the pose comes from: only the largest level is left to do.
+
+        Returns:
+            The attempt, the pose as T_frame_reference, and the normal matrix (6, 6) of the pose.
+        """
+        W = self.keyframes[reference].pose
+        task = self._task()
+        task["keyframe"], task["row"], task["top"], task["low"] = self._points_of(reference), row, self.plan.middle, 0
+        task["cost_level"] = self.judged
+        task["T"] = inverse(start) @ W
+        if best is not None:
+            task["top"], task["exposure"], task["T"] = self.judged, best.exposure, best.T_frame_keyframe
+        started = self.registrar.start(task)
+        wanted = [k for k, share in sorted(self._overlap.items(), key=lambda item: -item[1]) if share > MIN_OVERLAP]
+        joined = [reference, *[k for k in wanted if k != reference]][: max(self.config.joint, 1)]
+        to_reference = inverse(W) @ np.array([self.keyframes[k].pose for k in joined])
+        joint = np.zeros(1, registration.Joint.numpy_dtype())
+        joint["row"], joint["count"], joint["level"] = row, len(joined), 0
+        joint["keyframes"][0, : len(joined)] = [self._points_of(k) for k in joined]
+        joint["iterations"] = self.config.joint_iterations if self.config.joint > 0 else 0
+        joint["grey"], joint["depth"] = self.config.grey_weight, self.config.depth_weight
+        self._ask_motion(joint, frame, history, W)
+        final = self.registrar.join(started, joint, to_reference)
+        near = self._nearest(start)
+        shares = self.registrar.overlaps(
+            row,
+            final,
+            [self._points_of(k) for k in near],
+            inverse(W) @ np.array([self.keyframes[k].pose for k in near]),
+        )
+        result, last = started.numpy()[0], final.numpy()[0]
+        self._overlap = dict(zip(near, shares.numpy()[: len(near)].tolist(), strict=True))
+        attempt = self._attempt(reference, result)
+        if best is not None:
+            attempt = Attempt(reference, attempt.T_frame_keyframe, attempt.exposure, best.cost, best.measures, best.grey_scale, attempt.ok)
+        T, T_joint = (np.asarray(one["T"], np.float64) for one in (result, last))
+        step, turn = motion_between(T_joint, T)
+        if step > MAX_JOINT_STEP or turn > MAX_JOINT_TURN:
+            T_joint = T
+        self._seen = Measures.of(result["record_0"])
+        return attempt, T_joint, np.asarray(last["H"], np.float64)
+
+    def _attempt(self, keyframe: int, result: np.ndarray) -> Attempt:
+        record = result["record_1"] if self.judged == 1 else result["record_0"]
+        return Attempt(
+            keyframe,
+            np.asarray(result["T"], np.float64),
+            np.asarray(result["exposure"], np.float64),
+            float(result["end_cost"]),
+            Measures.of(record),
+            float(record[eq.GREY_SCALE]),
+            bool(result["ok"]) and bool(np.isfinite(result["T"]).all()),
+        )
+
+    def _is_sure(self, attempt: Attempt) -> bool:
+        """Whether nothing needs to be searched for."""
+        m, config = attempt.measures, self.config
+        limit = max(6.0, 2.0 * self._typical_scale)
+        return (
+            attempt.ok
+            and m.agreement > config.sure_agreement
+            and m.correlation > config.sure_correlation
+            and m.view > 0.4
+            and m.known > 0.2
+            and attempt.grey_scale < limit
+        )
+
+    def _is_good(self, attempt: Attempt) -> bool:
+        """Whether the pose can be believed."""
+        m, config = attempt.measures, self.config
+        return (
+            attempt.ok
+            and m.agreement > config.lost_agreement
+            and m.correlation > config.lost_correlation
+            and m.view > config.lost_view
+            and m.known > config.lost_known
+        )
+
+    # -- search --------------------------------------------------------------------------------------------------
+
+    def _look_everywhere(
+        self,
+        row: int,
+        frame: AdmittedFrame,
+        history: FrameHistory,
+        starts: Sequence[np.ndarray],
+        best: Attempt | None,
+    ) -> Attempt | None:
+        """At the reference, at the frame before, at older keyframes, until a pose is believed."""
+        last = history.last_known
+        if last is not None:
+            poses = [*starts, *self._turned(row, starts)]
+            found = self._search(row, self._points_of(self._reference), self._reference, poses, best)
+            best = _better(best, found, by_cost=True)
+            if best is not None and self._is_good(best):
+                return best
+            if history.was_known and self._before is not None and self._before[0] != self._reference_frame:
+                self._keep_before(history)
+                found = self._search(row, self._points_of(self._reference), self._reference, poses, None)
+                best = _better(best, found)
+                if best is not None and self._is_good(best):
+                    return best
+        return _better(best, self._relocalize(row))
+
+    def _turned(self, row: int, starts: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Starts whose rotation was found on the smallest images of the frame before."""
+        if self._before is None or not starts:
+            return []
+        before = self._row_of.get(self._before[0])
+        if before is None:
+            return []
+        rotations = self._best_rotations(self.registrar.smallest(before)[None], row, self.config.search_kept)[0]
+        last = starts[-1]
+        shift = inverse(last) @ starts[0]
+        poses = []
+        for R in rotations:
+            turn = np.eye(4)
+            turn[:3, :3] = R.T
+            poses.append(last @ turn)
+            if len(starts) > 1:
+                turn = turn.copy()
+                turn[:3, 3] = shift[:3, 3]
+                poses.append(last @ turn)
+        return poses
+
+    def _best_rotations(self, smallest: np.ndarray, row: int, count: int) -> list[list[np.ndarray]]:
+        """For each of some images the rotations into the frame that fit best and differ by more than 5 degrees."""
+        scores = self.registrar.rotations(smallest, row, self._rotations)
+        out = []
+        for line in scores:
+            found: list[np.ndarray] = []
+            for n in np.argsort(line, kind="stable")[:40]:
+                R = self._rotations[n]
+                if all(np.trace(R.T @ other) < 1.0 + 2.0 * np.cos(np.radians(5.0)) for other in found):
+                    found.append(R)
+                if len(found) == count:
+                    break
+            out.append(found)
+        return out
+
+    def _search(
+        self, row: int, points_row: int, keyframe: int, poses: Sequence[np.ndarray], best: Attempt | None
+    ) -> Attempt | None:
+        """The cheapest of many starts: each as it is and after the smallest levels, the best three refined."""
+        W = self.keyframes[keyframe].pose
+        top, middle, low = self.plan.top, self.plan.middle, self.judged
+        tasks = self._task(len(poses))
+        tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, middle
+        tasks["top"], tasks["low"], tasks["iterations"] = top, max(top - 1, 0), 6
+        tasks["T"] = inverse(np.asarray(poses)) @ W
+        results = self.registrar.register(tasks)
+        tried = [(float(r["start_cost"]), t["T"], np.array([1.0, 0.0])) for t, r in zip(tasks, results, strict=True)]
+        tried += [(float(r["end_cost"]), r["T"], r["exposure"]) for r in results if r["ok"]]
+        tried.sort(key=lambda one: one[0])
+        if self.config.search_weak:
+            tried += self._weak_starts(row, points_row, [tasks[0]["T"], tried[0][1]])
+            tried.sort(key=lambda one: one[0])
+        chosen: list[tuple[float, np.ndarray, np.ndarray]] = []
+        for one in tried:
+            if not np.isfinite(one[1]).all():
+                continue
+            motions = [motion_between(np.float64(other[1]), np.float64(one[1])) for other in chosen]
+            if all(step >= 0.015 or turn >= 0.7 for step, turn in motions):
+                chosen.append(one)
+            if len(chosen) == 3:
+                break
+        tasks = self._task(len(chosen))
+        tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, low
+        tasks["top"], tasks["low"] = middle, low
+        for task, (_, T, exposure) in zip(tasks, chosen, strict=True):
+            task["T"], task["exposure"] = T, exposure
+        for result in self.registrar.register(tasks):
+            found = self._attempt(keyframe, result)
+            if found.ok:
+                best = _better(best, found, by_cost=True)
+        return best
+
+    def _weak_starts(
+        self, row: int, points_row: int, transforms: Sequence[np.ndarray]
+    ) -> list[tuple[float, np.ndarray, np.ndarray]]:
+        """Poses along the two motions that depth determines least: a corridor's length, a wall's plane."""
+        middle = self.plan.middle
+        tasks = self._task(len(transforms))
+        tasks["keyframe"], tasks["row"], tasks["top"], tasks["low"] = points_row, row, middle, middle
+        tasks["grey"], tasks["iterations"] = 0.0, -1
+        tasks["T"] = np.asarray(transforms)
+        z = self.registrar.mean_depth(row)
+        D = np.diag([z, z, z, 1.0, 1.0, 1.0])
+        step = 1.0 / float(self.plan.levels[middle]["fx"])
+        steps = [n for n in range(-self.config.search_steps, self.config.search_steps + 1) if n]
+        moves = []
+        for result in self.registrar.register(tasks):
+            _, axes = np.linalg.eigh(D @ np.asarray(result["H"], np.float64) @ D)
+            T = np.asarray(result["T"], np.float64)
+            moves += [motion_of(D @ axes[:, axis] * (n * step)) @ T for axis in range(2) for n in steps]
+        tasks = self._task(len(moves))
+        tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, middle
+        tasks["top"], tasks["low"], tasks["iterations"] = middle, middle, -2
+        tasks["T"] = np.asarray(moves)
+        costs = self.registrar.register(tasks)["start_cost"]
+        found: list[tuple[float, np.ndarray, np.ndarray]] = []
+        for n in np.argsort(costs, kind="stable"):
+            T = moves[n]
+            motions = [motion_between(other[1], T) for other in found]
+            if all(shift > 2.5 * step * z or turn > 3.0 for shift, turn in motions):
+                found.append((float(costs[n]), T, np.array([1.0, 0.0])))
+            if len(found) == 6:
+                break
+        return found
+
+    def _relocalize(self, row: int) -> Attempt | None:
+        """At the keyframes whose smallest image fits best under some rotation."""
+        first = max(0, len(self.keyframes) - self.config.relocalization_keyframes)
+        numbers = list(range(first, len(self.keyframes)))
+        scores = self.registrar.rotations(np.array([self._smallest[k] for k in numbers]), row, self._rotations)
+        best: Attempt | None = None
+        for n in np.argsort(scores.min(axis=1), kind="stable")[:4]:
+            keyframe = numbers[n]
+            turn = np.eye(4)
+            turn[:3, :3] = self._rotations[scores[n].argmin()].T
+            pose = self.keyframes[keyframe].pose @ turn
+            best = _better(best, self._search(row, self._points_of(keyframe), keyframe, [pose], None))
+        return best
+
+    # -- keyframes -----------------------------------------------------------------------------------------------
+
+    def _is_new(self, row: int, pose: np.ndarray, attempt: Attempt) -> bool:
+        """Whether a frame sees so much else that it should be a keyframe."""
+        config, k = self.config, attempt.keyframe
+        step, turn = motion_between(self.keyframes[k].pose, pose)
+        return (
+            self._seen.view * self._seen.agreement < config.keyframe_overlap
+            or step > config.keyframe_step * self._mean_depth[k]
+            or turn > config.keyframe_turn
+        )
+
+    def _revisited(self, row: int, pose: np.ndarray, reference: int) -> int | None:
+        """An old keyframe that sees enough of the frame to serve again."""
+        config = self.config
+        best = max(self._overlap.items(), key=lambda item: item[1], default=None)
+        if best is None or best[1] <= config.keyframe_overlap or best[0] == reference:
+            return None
+        step, turn = motion_between(self.keyframes[best[0]].pose, pose)
+        far = 0.8 * config.keyframe_step * self.registrar.mean_depth(row)
+        return best[0] if step < far and turn < 0.8 * config.keyframe_turn else None
+
+    def _add_keyframe(self, index: int, pose: np.ndarray, rgb: np.ndarray, depth: np.ndarray) -> int:
+        """Make a frame whose images are loaded a keyframe, and the reference; its number."""
+        number = len(self.keyframes)
+        row = self._row_of[index]
+        self.registrar.select(row, self._points_of(number))
+        self.keyframes.append(Keyframe(index, self.images.add(rgb, depth), orthonormalized(pose)))
+        self._smallest.append(self.registrar.smallest(row))
+        self._mean_depth.append(self.registrar.mean_depth(row))
+        self._anchors[index] = _Anchor(number, np.eye(4))
+        self._overlap[number] = 1.0
+        self._reference = number
+        return number
+
+    def _keep_before(self, history: FrameHistory) -> None:
+        """The last frame that was OK becomes a keyframe: it is what a lost camera is nearest to."""
+        if self._before is None:
+            return
+        index, rgb, depth = self._before
+        anchor = self._anchors[index]
+        if anchor is None or self.keyframes[anchor.keyframe].index == index or index not in self._row_of:
+            return
+        self._add_keyframe(index, history.pose(index), rgb, depth)
+
+    def _refine(self, history: FrameHistory) -> None:
+        """Refine the keyframes around the newest, and move the frames that hang on them."""
+        if self.config.window < 2 or len(self.keyframes) < 3:
+            return
+        newest = len(self.keyframes) - 1
+        near = self._ranked(newest)
+        active = list(dict.fromkeys([newest, *near]))[: self.config.window]
+        active += [k for k in range(newest - 1, -1, -1) if k not in active][: self.config.window - len(active)]
+        active.sort()
+        members = [Pose(self._points_of(k), self._row(self.keyframes[k]), self.keyframes[k].pose) for k in active]
+        poses = refine_window(
+            self.registrar,
+            members,
+            self.judged,
+            self.config.grey_weight,
+            self.config.depth_weight,
+            self.config.window_iterations,
+        )
+        moved = set()
+        for k, pose in zip(active, poses, strict=True):
+            if not np.array_equal(pose, self.keyframes[k].pose):
+                self.keyframes[k].pose = pose
+                moved.add(k)
+        for index, anchor in enumerate(self._anchors):
+            if anchor is not None and anchor.keyframe in moved and index < len(history):
+                history.correct(index, self.keyframes[anchor.keyframe].pose @ anchor.T_keyframe_frame)
+
+    def _ranked(self, number: int) -> list[int]:
+        """Keyframes that overlap one, most first."""
+        pose = self.keyframes[number].pose
+        shares = self._overlaps_at(self._row(self.keyframes[number]), pose)
+        return [k for k, share in sorted(shares.items(), key=lambda item: -item[1]) if share > 0.2]
+
+    def _overlaps_at(self, row: int, pose: np.ndarray) -> dict[int, float]:
+        near = self._nearest(pose)
+        transforms = inverse(pose) @ np.array([self.keyframes[k].pose for k in near])
+        shares = self.registrar.overlap(row, [self._points_of(k) for k in near], transforms)
+        return dict(zip(near, shares.tolist(), strict=True))
+
+    def _nearest(self, pose: np.ndarray) -> list[int]:
+        """Keyframes nearest to a pose, in their order."""
+        poses = np.array([keyframe.pose for keyframe in self.keyframes])
+        if len(poses) <= NEAR_KEYFRAMES:
+            return list(range(len(poses)))
+        step, turn = motion_between(poses, np.broadcast_to(pose, poses.shape)).T
+        return sorted(np.argsort(step + DEGREE * turn, kind="stable")[:NEAR_KEYFRAMES].tolist())
+
+    # -- frames --------------------------------------------------------------------------------------------------
+
+    @property
+    def _reference_frame(self) -> int:
+        return self.keyframes[self._reference].index
+
+    def _points_of(self, keyframe: int) -> int:
+        return keyframe + 1
+
+    def _pose_of(self, attempt: Attempt) -> np.ndarray:
+        return self.keyframes[attempt.keyframe].pose @ inverse(attempt.T_frame_keyframe)
+
+    def _load(self, frame: AdmittedFrame) -> int:
+        row = self._take_row(frame.index)
+        rgb, depth, scale = self.images.arrays
+        self.registrar.load(row, rgb[0], depth[0], scale)
+        while len(self._anchors) <= frame.index:
+            self._anchors.append(None)
+        return row
+
+    def _row(self, keyframe: Keyframe) -> int:
+        """Where the images of a keyframe are."""
+        row = self._row_of.get(keyframe.index)
+        if row is not None:
+            self._row_of.move_to_end(keyframe.index)
+            return row
+        row = self._take_row(keyframe.index)
+        rgb, units, scale = self.images.kept(keyframe.image).unpack(self.camera)
+        device = self.device
+        self.registrar.load(
+            row,
+            wp.array(rgb, dtype=wp.uint8, device=device),
+            wp.array(units, dtype=wp.uint16, device=device),
+            wp.array([scale], dtype=float, device=device),
+        )
+        return row
+
+    def _take_row(self, index: int) -> int:
+        if index in self._row_of:
+            return self._row_of[index]
+        if len(self._row_of) < self.registrar.rows:
+            row = len(self._row_of)
+        else:
+            row = self._row_of.popitem(last=False)[1]
+        self._row_of[index] = row
+        return row
+
+    def _settle(self, frame: AdmittedFrame, anchor: _Anchor | None) -> None:
+        self._anchors[frame.index] = anchor
+
+    def _note(self, frame: AdmittedFrame) -> None:
+        self._before = frame.index, frame.rgb.copy(), frame.depth.copy()
+
+    def _set_motion(
+        self, row: int, frame: AdmittedFrame, history: FrameHistory, pose: np.ndarray | None
+    ) -> None:
+        del row, frame, history, pose
+
+    def _ask_motion(self, joint: np.ndarray, frame: AdmittedFrame, history: FrameHistory, W: np.ndarray) -> None:
+        del joint, frame, history, W
+
+
+def _better(a: Attempt | None, b: Attempt | None, *, by_cost: bool = False) -> Attempt | None:
+    if a is None or b is None:
+        return a if b is None else b
+    if by_cost:
+        return b if b.cost < a.cost else a
+    return b if b.measures.worth > a.measures.worth else a
+
+
+def _why_lost(best: Attempt | None) -> str:
+    if best is None:
+        return "no registration to a keyframe came to an end"
+    m = best.measures
+    return (
+        f"{m.agreement:.0%} of the depth agrees with the nearest keyframe, grey values correlate by {m.correlation:.2f}, "
+        f"{m.view:.0%} of it is in view"
+    )
+
+
+def rotation_grid(span: float) -> np.ndarray:
+    """Rotations (n, 3, 3): pitch and yaw every 3 degrees up to ``span``, roll -8, 0 and 8 degrees."""
+    angles = np.radians(np.arange(-span, span + 0.1, 3.0))
+    return np.array(
+        [
+            motion_of(np.array([0.0, 0.0, 0.0, pitch, yaw, roll]))[:3, :3]
+            for roll in np.radians([-8.0, 0.0, 8.0])
+            for pitch in angles
+            for yaw in angles
+        ]
+    )
+
+
+__all__ = ["Attempt", "DirectTracker", "points", "rotation_grid", "twist_of"]
