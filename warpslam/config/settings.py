@@ -201,6 +201,10 @@ class DirectConfig(_Group):
     keyframe_turn: float = Field(12.0, gt=0, description="or where it has turned by more [degrees]")
     sure_agreement: float = Field(0.85, ge=0, le=1, description="share of depth that agrees, for a pose beyond doubt")
     sure_correlation: float = Field(0.88, ge=-1, le=1, description="correlation of grey values, for the same")
+    sure_cost: float = Field(2.0, gt=1, description="robust cost over its running mean, for the same")
+    sure_shift: float = Field(
+        10.0, gt=0, description="shift of the image against what constant speed foretold, for the same [px of 80 x 60]"
+    )
     lost_agreement: float = Field(0.5, ge=0, le=1, description="share of depth that agrees, for a pose to be believed")
     lost_correlation: float = Field(0.85, ge=-1, le=1, description="correlation of grey values, for the same")
     lost_view: float = Field(0.15, ge=0, le=1, description="share of the keyframe in view, for the same")

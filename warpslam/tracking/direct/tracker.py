@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.config import DirectConfig
-from warpslam.frames import AdmittedFrame
+from warpslam.frames import AdmittedFrame, FrameStatus
 from warpslam.kernels.direct import equations as eq
 from warpslam.kernels.direct import points, registration
 from warpslam.poses import inverse, motion_between, motion_of, orthonormalized, twist_of
@@ -65,6 +65,8 @@ class Attempt:
     grey_scale: float
     """Spread of the photometric residuals [grey values]."""
     ok: bool = True
+    moved: float = 0.0
+    """How far the image moved from the start [px of the middle level]."""
 
 
 @dataclass(frozen=True)
@@ -104,11 +106,14 @@ class DirectTracker:
         self.registrar = Registrar(self.plan, RECENT + CACHED, max_depth, floors, device)
         self._row_of: OrderedDict[int, int] = OrderedDict()  # by frame, the one used longest ago first
         self._anchors: list[_Anchor | None] = []
+        self._offsets: dict[int, float] = {}
+        self._twists: dict[int, np.ndarray] = {}
         self._smallest: list[np.ndarray] = []
         self._mean_depth: list[float] = []
         self._overlap: dict[int, float] = {}  # with the last frame, by keyframe
         self._reference = 0
         self._typical_scale = np.inf
+        self._typical_cost = np.inf
         self._before: tuple[int, np.ndarray, np.ndarray] | None = None  # frame and images of the last that was OK
         self._rotations = rotation_grid(config.search_span)
         self.counts = {"sure": 0, "searched": 0}
@@ -124,7 +129,7 @@ class DirectTracker:
     def locate(self, frame: AdmittedFrame, history: FrameHistory) -> Located:
         """Pose of the frame, which comes after the frames of ``history``."""
         row = self._load(frame)
-        self._set_motion(row, frame, history, None)
+        self._foretell_motion(row, frame, history)
         starts = history.starts(constant_speed=True)
         if not self.keyframes or (not starts and not history.was_known):
             if not self.keyframes:
@@ -153,10 +158,17 @@ class DirectTracker:
             if not np.isfinite(self._typical_scale)
             else 0.9 * self._typical_scale + 0.1 * attempt.grey_scale
         )
+        self._typical_cost = (
+            attempt.cost if not np.isfinite(self._typical_cost) else 0.9 * self._typical_cost + 0.1 * attempt.cost
+        )
         self._reference = attempt.keyframe
         reference = self.keyframes[attempt.keyframe]
         pose = orthonormalized(reference.pose @ inverse(T_frame_reference))
         self._settle(frame, _Anchor(attempt.keyframe, inverse(reference.pose) @ pose))
+        self._note_motion(row, frame, pose, history)
+        anchor = self._anchors[frame.index]
+        assert anchor is not None
+        pose = reference.pose @ anchor.T_keyframe_frame
         after_loss = not history.was_known
         measures = attempt.measures
         located = Located(
@@ -212,10 +224,10 @@ class DirectTracker:
         W = self.keyframes[reference].pose
         task = self._task()
         task["keyframe"], task["row"], task["top"], task["low"] = self._points_of(reference), row, self.plan.middle, 0
-        task["cost_level"] = self.judged
+        task["cost_level"] = 0
         task["T"] = inverse(start) @ W
         if best is not None:
-            task["top"], task["exposure"], task["T"] = self.judged, best.exposure, best.T_frame_keyframe
+            task["top"], task["exposure"], task["T"] = 0, best.exposure, best.T_frame_keyframe
         started = self.registrar.start(task)
         wanted = [k for k, share in sorted(self._overlap.items(), key=lambda item: -item[1]) if share > MIN_OVERLAP]
         joined = [reference, *[k for k in wanted if k != reference]][: max(self.config.joint, 1)]
@@ -236,7 +248,7 @@ class DirectTracker:
         )
         result, last = started.numpy()[0], final.numpy()[0]
         self._overlap = dict(zip(near, shares.numpy()[: len(near)].tolist(), strict=True))
-        attempt = self._attempt(reference, result)
+        attempt = replace(self._attempt(reference, result), moved=self._shift(row, task[0]["T"], result["T"]))
         if best is not None:
             attempt = Attempt(reference, attempt.T_frame_keyframe, attempt.exposure, best.cost, best.measures, best.grey_scale, attempt.ok)
         T, T_joint = (np.asarray(one["T"], np.float64) for one in (result, last))
@@ -245,6 +257,12 @@ class DirectTracker:
             T_joint = T
         self._seen = Measures.of(result["record_0"])
         return attempt, T_joint, np.asarray(last["H"], np.float64)
+
+    def _shift(self, row: int, a: np.ndarray, b: np.ndarray) -> float:
+        """How far two transforms put points apart, about [px of the middle level]."""
+        step, turn = motion_between(np.asarray(a, np.float64), np.asarray(b, np.float64))
+        focal = float(self.plan.levels[self.plan.middle]["fx"])
+        return float(focal * (step / self.registrar.mean_depth(row) + np.radians(turn)))
 
     def _attempt(self, keyframe: int, result: np.ndarray) -> Attempt:
         record = result["record_1"] if self.judged == 1 else result["record_0"]
@@ -269,6 +287,8 @@ class DirectTracker:
             and m.view > 0.4
             and m.known > 0.2
             and attempt.grey_scale < limit
+            and attempt.cost < max(config.sure_cost * self._typical_cost, 0.5)
+            and attempt.moved < config.sure_shift
         )
 
     def _is_good(self, attempt: Attempt) -> bool:
@@ -349,7 +369,7 @@ class DirectTracker:
     ) -> Attempt | None:
         """The cheapest of many starts: each as it is and after the smallest levels, the best three refined."""
         W = self.keyframes[keyframe].pose
-        top, middle, low = self.plan.top, self.plan.middle, self.judged
+        top, middle = self.plan.top, self.plan.middle
         tasks = self._task(len(poses))
         tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, middle
         tasks["top"], tasks["low"], tasks["iterations"] = top, max(top - 1, 0), 6
@@ -371,8 +391,8 @@ class DirectTracker:
             if len(chosen) == 3:
                 break
         tasks = self._task(len(chosen))
-        tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, low
-        tasks["top"], tasks["low"] = middle, low
+        tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, 0
+        tasks["top"], tasks["low"] = middle, 0
         for task, (_, T, exposure) in zip(tasks, chosen, strict=True):
             task["T"], task["exposure"] = T, exposure
         for result in self.registrar.register(tasks):
@@ -533,6 +553,7 @@ class DirectTracker:
         return self.keyframes[attempt.keyframe].pose @ inverse(attempt.T_frame_keyframe)
 
     def _load(self, frame: AdmittedFrame) -> int:
+        self._offsets[frame.index] = frame.depth_offset
         row = self._take_row(frame.index)
         rgb, depth, scale = self.images.arrays
         self.registrar.load(row, rgb[0], depth[0], scale)
@@ -555,6 +576,8 @@ class DirectTracker:
             wp.array(units, dtype=wp.uint16, device=device),
             wp.array([scale], dtype=float, device=device),
         )
+        if keyframe.index in self._twists:
+            self._set_motion(row, keyframe.index, self._twists[keyframe.index])
         return row
 
     def _take_row(self, index: int) -> int:
@@ -573,13 +596,94 @@ class DirectTracker:
     def _note(self, frame: AdmittedFrame) -> None:
         self._before = frame.index, frame.rgb.copy(), frame.depth.copy()
 
-    def _set_motion(
-        self, row: int, frame: AdmittedFrame, history: FrameHistory, pose: np.ndarray | None
-    ) -> None:
-        del row, frame, history, pose
+    # -- motion within a frame -----------------------------------------------------------------------------------
+
+    def _is_timed(self, frame: AdmittedFrame) -> bool:
+        return frame.depth_offset != 0.0 or self.readout != 0.0
+
+    def _foretell_motion(self, row: int, frame: AdmittedFrame, history: FrameHistory) -> None:
+        """The camera moves during this frame as it did between the last ones."""
+        last = len(history) - 1
+        earlier = self._earlier(history, last)
+        if self._is_timed(frame) and earlier is not None:
+            elapsed = history.timestamp(last) - history.timestamp(earlier)
+            self._set_motion(row, frame.index, twist_of(inverse(history.pose(earlier)) @ history.pose(last)) / elapsed)
+
+    def _set_motion(self, row: int, index: int, twist: np.ndarray) -> None:
+        """How the camera moved, (v, w) [m/s, rad/s] in its own axes, while it took the frame in ``row``."""
+        motion = np.zeros(1, points.Motion.numpy_dtype())
+        motion["to_depth"] = motion_of(-self._offsets[index] * twist)
+        motion["velocity"], motion["spin"] = self.readout * twist[:3], self.readout * twist[3:]
+        motion["moves"] = 1
+        self._twists[index] = twist
+        self.registrar.set_motion(row, motion)
+
+    def _earlier(self, history: FrameHistory, last: int) -> int | None:
+        """A frame some steps before one that the camera has come from without a break; None if there is none."""
+        first = last
+        while first > max(0, last - TWIST_STEPS) and history.status(first - 1) is FrameStatus.OK:
+            first -= 1
+        if last < 0 or first == last or history.status(last) is not FrameStatus.OK:
+            return None
+        return first if history.timestamp(last) > history.timestamp(first) else None
 
     def _ask_motion(self, joint: np.ndarray, frame: AdmittedFrame, history: FrameHistory, W: np.ndarray) -> None:
-        del joint, frame, history, W
+        """Have the joint registration correct the motion by the pose that it begins with."""
+        last = frame.index - 1
+        if not self._is_timed(frame) or last < 0 or history.status(last) is not FrameStatus.OK:
+            return
+        earlier = last
+        while earlier > max(0, frame.index - TWIST_STEPS) and history.status(earlier - 1) is FrameStatus.OK:
+            earlier -= 1
+        joint["T_earlier_reference"] = inverse(history.pose(earlier)) @ W
+        joint["elapsed"] = frame.timestamp - history.timestamp(earlier)
+        joint["delay"], joint["readout"] = frame.depth_offset, self.readout
+
+    def _note_motion(self, row: int, frame: AdmittedFrame, pose: np.ndarray, history: FrameHistory) -> None:
+        """The motion during a frame that was located, and during the keyframe before it, now seen from both sides."""
+        i = frame.index
+        if not self._is_timed(frame) or i < 1 or history.status(i - 1) is not FrameStatus.OK:
+            return
+        earlier = max(0, i - TWIST_STEPS)
+        if history.status(earlier) is not FrameStatus.OK:
+            earlier = i - 1
+        elapsed = frame.timestamp - history.timestamp(earlier)
+        if elapsed <= 0:
+            return
+        twist = twist_of(inverse(history.pose(earlier)) @ pose) / elapsed
+        self._set_motion(row, i, twist)
+        number = len(self.keyframes) - 1
+        if i == TWIST_STEPS and number == 0:
+            self._begin_again(row, frame, twist, history)
+        elif i >= TWIST_STEPS and self.keyframes[number].index == i - 1 and earlier == i - 2:
+            self._correct_keyframe(number, twist)
+
+    def _correct_keyframe(self, number: int, twist: np.ndarray) -> None:
+        keyframe = self.keyframes[number]
+        row = self._row(keyframe)
+        self._set_motion(row, keyframe.index, twist)
+        self.registrar.select(row, self._points_of(number))
+
+    def _begin_again(self, row: int, frame: AdmittedFrame, twist: np.ndarray, history: FrameHistory) -> None:
+        """The first keyframe gets its motion from the two frames after it, and these are registered once more."""
+        self._correct_keyframe(0, twist)
+        W = self.keyframes[0].pose
+        del row
+        for index in (1, frame.index):
+            at = self._row_of.get(index)
+            anchor = self._anchors[index]
+            if at is None or anchor is None or anchor.keyframe != 0:
+                continue
+            self._set_motion(at, index, twist)
+            task = self._task()
+            task["keyframe"], task["row"], task["top"] = self._points_of(0), at, self.judged
+            task["T"] = inverse(anchor.T_keyframe_frame)
+            result = self.registrar.register(task)[0]
+            if result["ok"]:
+                T = orthonormalized(inverse(np.asarray(result["T"], np.float64)))
+                self._anchors[index] = _Anchor(0, T)
+                if index < len(history):
+                    history.correct(index, W @ T)
 
 
 def _better(a: Attempt | None, b: Attempt | None, *, by_cost: bool = False) -> Attempt | None:
@@ -611,6 +715,3 @@ def rotation_grid(span: float) -> np.ndarray:
             for yaw in angles
         ]
     )
-
-
-__all__ = ["Attempt", "DirectTracker", "points", "rotation_grid", "twist_of"]
