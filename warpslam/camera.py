@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -103,6 +103,40 @@ class SensorTiming:
 
 ONE_MOMENT = SensorTiming()
 """All pixels of a frame are taken at once."""
+
+
+@dataclass(frozen=True)
+class FrameMotion:
+    """How the camera moved while it took a frame, and for how long it took it."""
+
+    twist: tuple[float, ...] = (0.0,) * 6
+    """u = (v, w) in the camera's axes [m/s, rad/s]: T_world_camera(t + dt) = T_world_camera(t) exp(u dt)."""
+    depth_offset: float = 0.0
+    """tau, time of the depth image minus that of the colour image [s]."""
+    readout: float = 0.0
+    """Time from the first to the last row [s]."""
+
+    @property
+    def is_none(self) -> bool:
+        """Whether images show what they would if the camera stood still."""
+        return not any(self.twist) or (self.depth_offset == 0.0 and self.readout == 0.0)
+
+    def with_twist(self, twist: np.ndarray) -> FrameMotion:
+        """The same frame, taken with another twist (6,) [m/s, rad/s]."""
+        return replace(self, twist=tuple(float(value) for value in twist))
+
+    def to_array(self) -> np.ndarray:
+        """Twist, depth_offset and readout, float64 (8,)."""
+        return np.array([*self.twist, self.depth_offset, self.readout])
+
+    @classmethod
+    def from_array(cls, values: np.ndarray) -> FrameMotion:
+        """What `to_array` gave."""
+        *twist, depth_offset, readout = values.tolist()
+        return cls(tuple(twist), depth_offset, readout)
+
+
+NO_MOTION = FrameMotion()
 
 
 def check_number(value: float, name: str) -> float:

@@ -133,8 +133,8 @@ def admit(
         offset = timing.depth_offset(time, depth_time)
         if not abs(offset) <= MAX_DEPTH_OFFSET:
             raise FrameError(
-                f"its depth is {offset} s from its colour image (depth_timestamp); at most {MAX_DEPTH_OFFSET} s are "
-                "accepted"
+                f"its depth is {offset:.3g} s from its colour image (depth_timestamp); at most {MAX_DEPTH_OFFSET} s "
+                "are accepted"
             )
         if given is not None and not np.isfinite(given).all():
             if needs_pose:

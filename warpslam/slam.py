@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warpslam.camera import ONE_MOMENT, Intrinsics, SensorTiming
+from warpslam.camera import ONE_MOMENT, FrameMotion, Intrinsics, SensorTiming
 from warpslam.config import Config
 from warpslam.errors import InputError
 from warpslam.field.complexity import field_flops, weight_count
@@ -36,7 +36,7 @@ from warpslam.slam_state import SlamState, read_slam, write_slam
 from warpslam.tracking.direct.tracker import DirectTracker
 from warpslam.tracking.localizer import Localizer
 from warpslam.tracking.tracker import Tracker
-from warpslam.trajectory import FrameHistory, Located, Trajectory
+from warpslam.trajectory import TWIST_STEPS, FrameHistory, Located, Trajectory
 
 if TYPE_CHECKING:
     import trimesh
@@ -142,6 +142,7 @@ class Slam:
         self._make_current(frame)
         located = self._locate(frame, account)  # Sec. 3.3, Eq. 11-12
         self.history.add(frame.timestamp, located)
+        self._note_motion(frame)  # what is mapped and kept are images of one moment
         if located.status is FrameStatus.OK and self.config.mapping.enabled:
             is_keyframe = self._is_keyframe(frame)  # Sec. 3.4
             if self._is_due(frame):
@@ -260,6 +261,7 @@ class Slam:
         with account.timed("tracking"):
             if self.direct is not None:
                 return self.direct.locate(frame, self.history)
+            self.images.rectify_current(self._motion(frame))
             located = self.localizer.locate(self.scene.arrays(), self.images, frame.index, self.history, self.keyframes)
         if located.loss is not None:
             account.losses["tracking"] = located.loss
@@ -269,6 +271,27 @@ class Slam:
     def _has_begun(self) -> bool:
         """Whether there is something to track by."""
         return not self.scene.is_empty if self.direct is None else bool(self.keyframes)
+
+    def _motion(self, frame: AdmittedFrame) -> FrameMotion:
+        """How the camera moved while it took a frame, as far as is known by now."""
+        return FrameMotion(depth_offset=frame.depth_offset, readout=self._timing.readout).with_twist(
+            self.history.twist()
+        )
+
+    def _note_motion(self, frame: AdmittedFrame) -> None:
+        """Rectify the current image by how the camera came to its pose; and tell a keyframe just before of what came
+        after it: between two frames it moved as over both steps, and the first had no step at all.
+        """
+        if self.direct is not None:
+            self.images.rectify_current(self.direct.motion)
+            return
+        motion = self._motion(frame)
+        self.images.rectify_current(motion)
+        last = self.keyframes[-1] if self.keyframes else None
+        if last is None or self.history.last_known != frame.index:
+            return
+        if frame.index - last.index <= (1 if self.history.follows(last.index) else TWIST_STEPS):
+            last.motion = last.motion.with_twist(np.array(motion.twist))
 
     def _is_keyframe(self, frame: AdmittedFrame) -> bool:
         config = self.config.keyframes
@@ -284,10 +307,11 @@ class Slam:
         """Have a frame mapped."""
         is_first, pose = self.scene.is_empty, self.history.pose(frame.index)
         with account.timed("mapping"):
-            extent = measured_extent(frame.depth, pose, self.intrinsics)
+            depth = frame.depth if self.images.motion.is_none else self.images.current_depth()
+            extent = measured_extent(depth, pose, self.intrinsics)
             task = MappingTask("first" if is_first else "frame", frame.index, pose, extent)
             self.scheduler.start(task, [keyframe for keyframe in self.keyframes if keyframe.index != frame.index])
-            self._seen.append(SeenDepth.of(frame.index, frame.depth))
+            self._seen.append(SeenDepth.of(frame.index, depth))
             account.losses.update(self._take_over(wait=is_first))
 
     def _take_over(self, *, wait: bool = False) -> dict[str, float]:
@@ -305,7 +329,7 @@ class Slam:
     def _insert_keyframe(self, frame: AdmittedFrame, account: _Account) -> None:
         with account.timed("keyframe"):
             image = self.images.keep_current()
-            self.keyframes.append(Keyframe(frame.index, image, self.history.pose(frame.index)))
+            self.keyframes.append(Keyframe(frame.index, image, self.history.pose(frame.index), self.images.motion))
 
     def _refine(self, index: int, first_round: int, rounds: int) -> None:
         which = range(first_round, first_round + rounds)
@@ -445,6 +469,7 @@ class Slam:
             history=self.history.state(),
             scene=self.scene.state(),
             current_image=self.images.current(),
+            current_motion=self.images.motion,
             keyframes=[(keyframe, self.images.kept(keyframe.image)) for keyframe in self.keyframes],
             seen=self._seen,
             current=self._current,
@@ -466,14 +491,17 @@ class Slam:
         slam = cls(state.intrinsics, config, device, state.seed, decoders=state.scene.decoders, timing=state.timing)
         slam.history = FrameHistory.restored(state.history)
         slam.scene.restore(state.scene)
-        slam.images.restore(state.current_image, [image for _, image in state.keyframes])
-        slam.keyframes = [Keyframe(one.index, n, one.pose.copy()) for n, (one, _) in enumerate(state.keyframes)]
+        images = [image for _, image in state.keyframes]
+        slam.images.restore(state.current_image, state.current_motion, images)
+        slam.keyframes = [
+            Keyframe(one.index, n, one.pose.copy(), one.motion) for n, (one, _) in enumerate(state.keyframes)
+        ]
         slam._seen = list(state.seen)
         slam._current, slam._mapped = state.current, state.mapped
         if slam.direct is not None:
             slam.direct = slam._direct_tracker()
             if state.direct is not None:
-                slam.direct.restore(state.direct, state.current)
+                slam.direct.restore(state.direct, state.current, state.current_motion)
         return slam
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpslam.camera import Intrinsics, SensorTiming
+from warpslam.camera import FrameMotion, Intrinsics, SensorTiming
 from warpslam.config import Config
 from warpslam.errors import ConfigError, InputError
 from warpslam.field.decoders import LEVELS, Decoders, DecoderWeights, expected_shapes
@@ -48,7 +48,9 @@ class SlamState:
     scene: SceneState
     """The map."""
     current_image: tuple[np.ndarray, np.ndarray, float]
-    """Colour, uint16 depth and its scale of the current frame."""
+    """Colour, uint16 depth and its scale of the current frame, as it was taken."""
+    current_motion: FrameMotion
+    """What it is rectified by."""
     keyframes: Sequence[tuple[Keyframe, CompactImage]]
     """In their order."""
     seen: Sequence[SeenDepth]
@@ -113,10 +115,12 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
     rgb, depth, scale = state.current_image
     images = [image for _, image in state.keyframes]
     keyframe_poses = [keyframe.pose for keyframe, _ in state.keyframes]
+    motions = [state.current_motion, *(keyframe.motion for keyframe, _ in state.keyframes)]
     seen = [one.millimetres for one in state.seen]
     arrays: dict[str, np.ndarray] = {
         **state.history.arrays(),
         "bounds": np.stack([state.scene.low, state.scene.high]),
+        "motions": np.array([one.to_array() for one in motions], np.float64),
         "keyframe_poses": np.array(keyframe_poses, np.float64).reshape(-1, 4, 4),
         "seen": np.array(seen, np.uint16).reshape(-1, *_seen_size(state.intrinsics)),
         "current_rgb": rgb,
@@ -172,7 +176,8 @@ def state_from_arrays(
     scales = fields.array("image_scales", np.float64, (len(frames) + 1,)).tolist()
     images = [_image(fields, n, scales[n + 1], camera) for n in range(len(frames))]
     poses = fields.array("keyframe_poses", np.float64, (len(frames), 4, 4)).copy()
-    keyframes = [Keyframe(index, n, pose) for n, (index, pose) in enumerate(zip(frames, poses, strict=True))]
+    motions = [FrameMotion.from_array(one) for one in fields.array("motions", np.float64, (len(frames) + 1, 8))]
+    keyframes = [Keyframe(index, n, poses[n], motions[n + 1]) for n, index in enumerate(frames)]
     seen = fields.frames("seen", count)
     depths = fields.array("seen", np.uint16, (len(seen), *_seen_size(camera)))
     rgb, depth = fields.array("current_rgb", np.uint8, (*size, 3)), fields.array("current_depth", np.uint16, size)
@@ -187,6 +192,7 @@ def state_from_arrays(
         history=history,
         scene=SceneState(decoders, low, high, {level: _grid(fields, level) for level in LEVELS}),
         current_image=(rgb, depth, scales[0]),
+        current_motion=motions[0],
         keyframes=list(zip(keyframes, images, strict=True)),
         seen=[SeenDepth(index, image) for index, image in zip(seen, depths, strict=True)],
         current=fields.frame("current", count),
@@ -247,8 +253,6 @@ def _direct(fields: StateFields, frames: int, keyframes: int) -> DirectState | N
     return DirectState(
         anchors=anchors.copy(),
         relative=fields.array("direct_relative", np.float64, (count, 4, 4)).copy(),
-        offsets=fields.array("direct_offsets", np.float64, (count,)).copy(),
-        twists=fields.array("direct_twists", np.float64, (count, 6)).copy(),
         overlap=fields.array("direct_overlap", np.float64, (keyframes,)).copy(),
         reference=reference,
         before=before,
