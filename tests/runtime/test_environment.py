@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 
-import numpy as np
 import psutil
 import pytest
 import torch
@@ -15,7 +14,6 @@ import warp as wp
 
 from warpslam.errors import ConfigError
 from warpslam.runtime import cores, environment
-
 
 _GROW = """
 import json
