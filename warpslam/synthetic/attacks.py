@@ -86,8 +86,10 @@ class AlteredSequence(RgbdSequence):
         if self._times is not None:
             return float(self._times[index])
         place = int(self.places[index])
-        known = getattr(self.base, "timestamp", None)
-        return float(known(place)) if known is not None else self.base[place].timestamp
+        if hasattr(self.base, "timestamp"):
+            return float(self.base.timestamp(place))
+        known = getattr(self.base, "timestamps", None)  # of files
+        return self.base[place].timestamp if known is None else float(known[place])
 
     def ground_truth(self) -> np.ndarray | None:
         """All poses, float64, shape (N, 4, 4), NaN where one is unknown; None if there are none."""
