@@ -59,8 +59,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--through", type=points, metavar='"X,Y X,Y ..."', help="walk through these points [m] instead")
     parser.add_argument("--hand-held", action="store_true", help="walk so: 8 cm, 4 deg a frame, pauses, quick turns")
     parser.add_argument("--noise", action="store_true", help="depth of a Kinect: noise, steps, holes")
+    parser.add_argument("--depth-range", type=float, help="depth beyond is missing [m], colour is seen")
     parser.add_argument("--exposure", type=float, default=0.0, help="motion blur: shutter time over frame time")
-    parser.add_argument("--max-depth", type=float, default=100.0, help="range of the depth camera [m]")
+    parser.add_argument("--max-depth", type=float, default=100.0, help="nothing is seen beyond [m]")
     parser.add_argument("--seed", type=int, default=0, help="seed of the hand's sway and of the noise")
     parser.add_argument("--device", help="Warp device that renders")
     return parser.parse_args(arguments)
@@ -90,7 +91,14 @@ def make_sequence(options: argparse.Namespace) -> RenderedSequence:
         )
     renderer = MeshRenderer(load_mesh(options.mesh), intrinsics, device=options.device, max_depth=options.max_depth)
     noise_seed = options.seed if options.noise else None
-    return RenderedSequence("mesh", renderer, poses, noise_seed=noise_seed, exposure=options.exposure)
+    return RenderedSequence(
+        "mesh",
+        renderer,
+        poses,
+        noise_seed=noise_seed,
+        exposure=options.exposure,
+        depth_range=options.depth_range,
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:
