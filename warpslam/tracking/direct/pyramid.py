@@ -92,4 +92,4 @@ def _fits(camera: Intrinsics, edge: int) -> bool:
 
 def records(struct: Any, count: int = 1) -> Any:
     """A structured array of zeros for a struct of Warp, (count,)."""
-    return records(struct, count)
+    return np.zeros(count, struct.numpy_dtype())
