@@ -11,6 +11,20 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
+LONGEST = (
+    "examples/test_examples.py", "tracking/test_localizer.py", "kernels/test_cuda_compile.py", "test_slam.py",
+    "pipeline/test_resume.py", "report/test_comparison.py", "mapping/test_mapper.py", "baselines/test_imap.py",
+    "batch/test_batch_resume.py", "batch/test_cluster.py", "tools/test_gpu_checks.py", "tools/test_pretraining.py",
+    "tools/test_decoder_comparison.py", "synthetic/test_moving.py", "mapping/test_scheduler.py",
+)  # fmt: skip
+"""Files that take longest, the longest first."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The longest files come first: of several workers, none is left alone with one at the end."""
+    rank = {REPOSITORY / "tests" / name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path, len(rank)))
+
 
 def _shared_path(variable: str, default: str) -> Path:
     """Path named by an environment variable, else ``default`` beside the repository; skips if it isn't there."""

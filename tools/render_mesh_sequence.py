@@ -12,8 +12,8 @@ import time
 import numpy as np
 
 from warpslam.camera import Intrinsics
-from warpslam.errors import WarpSlamError
-from warpslam.synthetic import MeshRenderer, RenderedSequence, load_mesh, orbit, walk, write_replica
+from warpslam.errors import InputError, WarpSlamError
+from warpslam.synthetic import MeshRenderer, RenderedSequence, hand_held, load_mesh, orbit, walk, write_replica
 
 # The defaults look at the dining table of the furnished test house, from the kitchen's side of the room.
 ROOM = (6.6, 1.1)  # [m] point to look at, seen from above
@@ -47,7 +47,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--mesh", required=True, help="mesh file, metres, z up; materials and textures are used")
     parser.add_argument("--out", required=True, help="folder to write; must not hold frames yet")
-    parser.add_argument("--frames", type=int, default=120, help="number of frames")
+    parser.add_argument("--frames", type=int, help="number of frames (120; hand-held: to the end of the path)")
     parser.add_argument("--size", type=pair("x", int), default=(640, 480), metavar="WxH", help="image size [px]")
     parser.add_argument("--focal", type=float, help="focal length [px]; default 525 at a width of 640 px")
     parser.add_argument("--room", type=pair(",", float), default=ROOM, metavar="X,Y", help="point to look at [m]")
@@ -57,8 +57,12 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--start", type=float, default=START_ANGLE, help="direction of the first camera [deg]")
     parser.add_argument("--step", type=float, default=STEP, help="distance between frames [m]; negative = clockwise")
     parser.add_argument("--through", type=points, metavar='"X,Y X,Y ..."', help="walk through these points [m] instead")
-    parser.add_argument("--max-depth", type=float, default=100.0, help="range of the depth camera [m]")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the hand's sway")
+    parser.add_argument("--hand-held", action="store_true", help="walk so: 8 cm, 4 deg a frame, pauses, quick turns")
+    parser.add_argument("--noise", action="store_true", help="depth of a Kinect: noise, steps, holes")
+    parser.add_argument("--depth-range", type=float, help="depth beyond is missing [m], colour is seen")
+    parser.add_argument("--exposure", type=float, default=0.0, help="motion blur: shutter time over frame time")
+    parser.add_argument("--max-depth", type=float, default=100.0, help="nothing is seen beyond [m]")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the hand's sway and of the noise")
     parser.add_argument("--device", help="Warp device that renders")
     return parser.parse_args(arguments)
 
@@ -68,20 +72,33 @@ def make_sequence(options: argparse.Namespace) -> RenderedSequence:
     width, height = options.size
     focal = options.focal or 525.0 * width / 640.0
     intrinsics = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
-    if options.through is not None:
-        poses = walk(options.through, options.frames, eye_height=options.eye_height)
+    frame_count = options.frames or 120
+    if options.hand_held:
+        if options.through is None:
+            raise InputError("--hand-held walks along the points of --through, which is missing")
+        poses = hand_held(options.through, seed=options.seed, eye_height=options.eye_height, max_frames=options.frames)
+    elif options.through is not None:
+        poses = walk(options.through, frame_count, eye_height=options.eye_height)
     else:
         poses = orbit(
             np.array([*options.room, options.eye_height]),
             (options.radius, options.radius),
-            options.frames,
+            frame_count,
             turn=options.step / options.radius,
             start=np.radians(options.start),
             aim=options.target_height,
             phase=np.random.default_rng(options.seed).uniform(0, 2 * np.pi),
         )
     renderer = MeshRenderer(load_mesh(options.mesh), intrinsics, device=options.device, max_depth=options.max_depth)
-    return RenderedSequence("mesh", renderer, poses)
+    noise_seed = options.seed if options.noise else None
+    return RenderedSequence(
+        "mesh",
+        renderer,
+        poses,
+        noise_seed=noise_seed,
+        exposure=options.exposure,
+        depth_range=options.depth_range,
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:

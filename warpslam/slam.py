@@ -33,6 +33,7 @@ from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.mapped_views import ObservedView, SeenDepth
 from warpslam.scene.scene_map import SceneMap
 from warpslam.slam_state import SlamState, read_slam, write_slam
+from warpslam.tracking.direct.tracker import DirectTracker
 from warpslam.tracking.localizer import Localizer
 from warpslam.tracking.tracker import Tracker
 from warpslam.trajectory import TWIST_STEPS, FrameHistory, Located, Trajectory
@@ -51,7 +52,7 @@ class Slam:
         slam.mesh().export("mesh.ply")
 
     Its parts: ``scene`` (the map), ``history`` (what became of every frame), ``keyframes``, ``images`` (theirs, and the
-    current frame's), ``tracker`` and ``localizer``, ``mapper`` and ``scheduler``.
+    current frame's), ``direct`` (or ``tracker`` and ``localizer``), ``mapper`` and ``scheduler``.
 
     Args:
         intrinsics: Camera of all frames.
@@ -92,6 +93,7 @@ class Slam:
         self.tracker = Tracker(intrinsics, self.config.tracking, self.config.sampling, self.device, seed)
         self.localizer = Localizer(self.tracker, self.config.tracking, intrinsics)
         self.mapper = Mapper(self.scene, intrinsics, self.config.mapping, self.config.sampling, self.device, seed)
+        self.direct = self._direct_tracker()
         self.scheduler = new_scheduler(self.config.schedule, self.mapper, self.images)
         self._seen: list[SeenDepth] = []
         self._current: int | None = None
@@ -195,6 +197,14 @@ class Slam:
         """
         self.history.break_off()
 
+    def _direct_tracker(self) -> DirectTracker | None:
+        if self.config.tracking.optimizer != "direct" or self.config.tracking.use_given_poses:
+            return None
+        max_depth, readout = self.config.grid.max_depth, self._timing.readout
+        return DirectTracker(
+            self.intrinsics, self.config.direct, max_depth, self.device, self.keyframes, self.images, readout
+        )
+
     # -- its steps -----------------------------------------------------------------------------------------------
 
     def _admit(
@@ -233,7 +243,7 @@ class Slam:
 
     def _make_current(self, frame: AdmittedFrame) -> None:
         """Its images into slot 0 of the pool."""
-        if self.scene.is_empty and not self.config.mapping.enabled:
+        if self.scene.is_empty and not self.config.mapping.enabled and self.direct is None:
             raise InputError("the map is empty and mapping.enabled is off: load a map with Slam.load")
         self.images.set(0, frame.rgb, frame.depth)
         self._current = frame.index
@@ -241,15 +251,26 @@ class Slam:
     def _locate(self, frame: AdmittedFrame, account: _Account) -> Located:
         """Where the camera is: tracked against the map; given, or the origin, where there is nothing to track by."""
         given = frame.given_pose
-        is_starting = self.history.last_known is None and given is not None
-        if self.scene.is_empty or self.config.tracking.use_given_poses or is_starting:
-            return Located(np.eye(4) if given is None else given)
+        is_starting = self.history.last_known is None and (given is not None or not self._has_begun)
+        if self.config.tracking.use_given_poses or is_starting:
+            pose = np.eye(4) if given is None else given
+            if self.direct is not None:
+                with account.timed("tracking"):
+                    self.direct.place(frame, pose)
+            return Located(pose)
         with account.timed("tracking"):
+            if self.direct is not None:
+                return self.direct.locate(frame, self.history)
             self.images.rectify_current(self._motion(frame))
             located = self.localizer.locate(self.scene.arrays(), self.images, frame.index, self.history, self.keyframes)
         if located.loss is not None:
             account.losses["tracking"] = located.loss
         return located
+
+    @property
+    def _has_begun(self) -> bool:
+        """Whether there is something to track by."""
+        return not self.scene.is_empty if self.direct is None else bool(self.keyframes)
 
     def _motion(self, frame: AdmittedFrame) -> FrameMotion:
         """How the camera moved while it took a frame, as far as is known by now."""
@@ -261,6 +282,9 @@ class Slam:
         """Rectify the current image by how the camera came to its pose; and tell a keyframe just before of what came
         after it: between two frames it moved as over both steps, and the first had no step at all.
         """
+        if self.direct is not None:
+            self.images.rectify_current(self.direct.motion)
+            return
         motion = self._motion(frame)
         self.images.rectify_current(motion)
         last = self.keyframes[-1] if self.keyframes else None
@@ -271,6 +295,8 @@ class Slam:
 
     def _is_keyframe(self, frame: AdmittedFrame) -> bool:
         config = self.config.keyframes
+        if self.direct is not None:
+            return False  # it makes them itself
         if not self.keyframes:
             return True
         if config.policy == "interval":
@@ -284,7 +310,7 @@ class Slam:
             depth = frame.depth if self.images.motion.is_none else self.images.current_depth()
             extent = measured_extent(depth, pose, self.intrinsics)
             task = MappingTask("first" if is_first else "frame", frame.index, pose, extent)
-            self.scheduler.start(task, self.keyframes)
+            self.scheduler.start(task, [keyframe for keyframe in self.keyframes if keyframe.index != frame.index])
             self._seen.append(SeenDepth.of(frame.index, depth))
             account.losses.update(self._take_over(wait=is_first))
 
@@ -448,6 +474,7 @@ class Slam:
             seen=self._seen,
             current=self._current,
             mapped=self._mapped,
+            direct=None if self.direct is None else self.direct.state(),
         )
 
     @classmethod
@@ -471,6 +498,10 @@ class Slam:
         ]
         slam._seen = list(state.seen)
         slam._current, slam._mapped = state.current, state.mapped
+        if slam.direct is not None:
+            slam.direct = slam._direct_tracker()
+            if state.direct is not None:
+                slam.direct.restore(state.direct, state.current, state.current_motion)
         return slam
 
 

@@ -23,6 +23,7 @@ from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
 from warpslam.scene.scene_map import SceneState
 from warpslam.storage.state_file import StateFields, StateFormat, read_state, write_state
+from warpslam.tracking.direct.tracker import DirectState
 from warpslam.trajectory import HistoryState
 
 MAP_FORMAT = StateFormat("warpslam-map", 6, "the map of a run with --method nice-slam")
@@ -58,6 +59,8 @@ class SlamState:
     """The current frame, if there is one."""
     mapped: int | None
     """The last frame that was mapped, if there is one."""
+    direct: DirectState | None = None
+    """What direct tracking goes on from."""
 
 
 def write_slam(path: Path, state: SlamState) -> None:
@@ -107,6 +110,7 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
         "first": state.history.first,
         "keyframes": [keyframe.index for keyframe, _ in state.keyframes],
         "seen": [seen.index for seen in state.seen],
+        "direct": None if state.direct is None else _direct_header(state.direct),
     }
     rgb, depth, scale = state.current_image
     images = [image for _, image in state.keyframes]
@@ -123,6 +127,8 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
         "current_depth": depth,
         "image_scales": np.array([scale, *(image.scale for image in images)], np.float64),
     }
+    if state.direct is not None:
+        arrays |= {f"direct_{name}": array for name, array in state.direct.arrays().items()}
     for n, image in enumerate(images):
         arrays[f"image_{n}_rgb"] = np.frombuffer(image.rgb, np.uint8)
         arrays[f"image_{n}_depth"] = np.frombuffer(image.depth, np.uint8)
@@ -191,6 +197,7 @@ def state_from_arrays(
         seen=[SeenDepth(index, image) for index, image in zip(seen, depths, strict=True)],
         current=fields.frame("current", count),
         mapped=fields.frame("mapped", count),
+        direct=_direct(fields, count, len(frames)),
     )
 
 
@@ -220,6 +227,37 @@ def _image(fields: StateFields, n: int, scale: float, camera: Intrinsics) -> Com
     except (ValueError, zlib.error) as error:
         raise fields.damaged(f"image_{n}", error) from None
     return image
+
+
+def _direct_header(state: DirectState) -> dict[str, Any]:
+    # JSON knows no infinity.
+    scale, cost = (value if np.isfinite(value) else None for value in state.typical)
+    return {"reference": state.reference, "before": state.before, "scale": scale, "cost": cost}
+
+
+def _direct(fields: StateFields, frames: int, keyframes: int) -> DirectState | None:
+    header = fields.header.get("direct")
+    if header is None:
+        return None
+    anchors = fields.array("direct_anchors", np.int64, (None,))
+    count = len(anchors)
+    if count > frames or (anchors >= keyframes).any():
+        raise fields.damaged("direct_anchors", f"{count} frames of {frames}, keyframes up to {anchors.max(initial=-1)}")
+    try:
+        reference, before = int(header["reference"]), int(header["before"])
+        scale, cost = (np.inf if header[name] is None else float(header[name]) for name in ("scale", "cost"))
+    except (KeyError, TypeError, ValueError) as error:
+        raise fields.damaged("direct", error) from None
+    if not (0 <= reference < max(keyframes, 1) and -1 <= before < frames):
+        raise fields.damaged("direct", f"reference {reference} of {keyframes}, frame {before} of {frames}")
+    return DirectState(
+        anchors=anchors.copy(),
+        relative=fields.array("direct_relative", np.float64, (count, 4, 4)).copy(),
+        overlap=fields.array("direct_overlap", np.float64, (keyframes,)).copy(),
+        reference=reference,
+        before=before,
+        typical=(scale, cost),
+    )
 
 
 def _seen_size(camera: Intrinsics) -> tuple[int, int]:

@@ -208,16 +208,25 @@ class FrameHistory:
         """Mean twist (v, w) of the camera [m/s, rad/s] over the last ``steps`` frames, in its axes, (6,); 0 where it is
         not known.
         """
-        last = self.last_known
-        if last is None or last != len(self) - 1:
+        last, first = len(self) - 1, self.earlier(steps)
+        if first is None:
             return np.zeros(6)
-        first = last
-        while first > last - steps and self.follows(first):
-            first -= 1
         seconds = self._timestamps[last] - self._timestamps[first]
         if first == last or seconds <= 0.0:
             return np.zeros(6)
         return twist_of(inverse(self._poses[first]) @ self._poses[last]) / seconds
+
+    def earlier(self, steps: int) -> int | None:
+        """The frame ``steps`` before the last, or as many as the camera has moved without a break since; None if the
+        pose of the last frame is not known.
+        """
+        last = self.last_known
+        if last is None or last != len(self) - 1:
+            return None
+        first = last
+        while first > last - steps and self.follows(first):
+            first -= 1
+        return first
 
     def is_jump(self, T_world_camera: np.ndarray, max_step: float, max_turn: float) -> bool:
         """Whether the camera can't well have come to a pose: a step beyond ``max_step`` [m] or ``max_turn`` [degrees] a

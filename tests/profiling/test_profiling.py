@@ -70,7 +70,7 @@ def run(frames):
     """A run with two slices on any machine, profiled from the first frame to the mesh."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(recorder, "matrix_peak_gflops", lambda: 100.0)
-        patch.setattr("psutil.Process.cpu_affinity", lambda self: [0, 1], raising=False)
+        patch.setattr("warpslam.runtime.cores._core_count", lambda: 2)
         slam = new_slam(*SETTINGS)
         with warpslam.profile() as profile:
             timings = [result.timings for result in steps(slam, frames)]

@@ -9,7 +9,7 @@ from PIL import Image
 
 from warpslam import cli, open_sequence
 from warpslam.errors import ConfigError
-from warpslam.synthetic import MovingObjectSequence, make_sequence
+from warpslam.synthetic import MovingObjectSequence, altered, make_sequence
 
 
 def written(tmp_path, *arguments: str):
@@ -52,6 +52,16 @@ def test_room_sequence(tmp_path):
     assert len(open_sequence(folder)) == 3 and not (folder / "masks").exists()
 
 
+def test_hard_scene_with_something_wrong(tmp_path):
+    """A named scene with changes is written as it is made, with its surface and its times."""
+    folder = written(tmp_path, "--kind", "posters", "--frames", "24", "--with", "hand", "exposure")
+    read = open_sequence(folder)
+    made = altered(make_sequence("posters", 0, 24, intrinsics=read.intrinsics), ["hand", "exposure"])
+    np.testing.assert_array_equal(read[13].rgb, made[13].rgb)
+    assert len(trimesh.load(folder / "mesh.ply").faces) == len(made.mesh.faces)
+    assert len(np.loadtxt(folder / "timestamps.txt")) == 24
+
+
 def test_sheet(tmp_path):
     """A picture of the rooms that are asked for."""
     assert cli.main(["render-room", "sheet", "--seeds", "0", "--views", "1", "--out", str(tmp_path / "rooms.png")]) == 0
@@ -62,5 +72,5 @@ def test_errors(tmp_path, capsys):
     """What can be put right is one line and exit code 2; an unknown kind names the known ones."""
     assert cli.main(["render-room", "sequence", "--kind", "gap", "--frames", "2", "--out", str(tmp_path / "a")]) == 2
     assert capsys.readouterr().err.startswith("warpslam: a gap of")
-    with pytest.raises(ConfigError, match="room, moving, gap"):
+    with pytest.raises(ConfigError, match="room, moving, gap, corridor, cabinet, posters"):
         make_sequence("flying")

@@ -14,11 +14,12 @@ from PIL import Image
 
 from warpslam.camera import Intrinsics
 from warpslam.errors import DatasetError, InputError
-from warpslam.sequences.base import Frame, RgbdSequence
+from warpslam.sequences import Frame, RgbdSequence, open_sequence
 from warpslam.synthetic import (
     MeshRenderer,
     SyntheticSequence,
     contact_sheet,
+    hand_held,
     load_mesh,
     look_at,
     make_room,
@@ -198,6 +199,27 @@ def test_mesh_tool(tmp_path):
     assert centre[:2] == [0.0, 0.0] and centre[2] == pytest.approx(2.0, abs=0.1)
     failed = subprocess.run([*command, "--mesh", str(tmp_path / "none.obj")], capture_output=True, text=True)
     assert failed.returncode == 1 and "none.obj" in failed.stderr
+
+
+def test_mesh_tool_with_a_hand_held_camera(tmp_path, capsys):
+    """To the end of the way at the pace of a hand; depth is a Kinect's and ends at its range, colour does not."""
+    from tools import render_mesh_sequence as tool
+
+    mesh = tmp_path / "box.ply"
+    trimesh.creation.box(extents=(8.0, 8.0, 3.0)).export(mesh)
+    command = ["--mesh", str(mesh), "--size", "32x24", "--eye-height", "0.2", "--through=-2,0 1,0.5 2,2"]
+    assert tool.main([*command, "--out", str(tmp_path / "out"), "--hand-held", "--noise", "--depth-range", "4"]) == 0
+    read = open_sequence(tmp_path / "out")
+    truth = read.ground_truth()
+    np.testing.assert_allclose(truth, hand_held(np.array([[-2, 0], [1, 0.5], [2, 2]]), eye_height=0.2), atol=1e-9)
+    options = tool.parse_arguments([*command, "--out", "", "--hand-held"])
+    exact = tool.make_sequence(options)
+    assert (read[0].depth > 4.5).sum() == 0 < (exact[0].depth > 4.5).sum()
+    np.testing.assert_array_equal(read[0].rgb, exact[0].rgb)
+    both = (read[0].depth > 0) & (exact[0].depth < 3.5)
+    assert 1e-3 < np.abs(read[0].depth - exact[0].depth)[both].mean() < 0.3
+    assert tool.main(["--mesh", str(mesh), "--out", str(tmp_path / "no"), "--hand-held"]) == 1
+    assert "--through" in capsys.readouterr().err
 
 
 def test_house_mesh_renders(data_dir):

@@ -9,7 +9,15 @@ from PIL import Image
 
 from warpslam.camera import Intrinsics
 from warpslam.cli.common import add_command, add_device_option, quiet_warp
-from warpslam.synthetic import GAP_KINDS, SEQUENCE_KINDS, contact_sheet, make_sequence, write_sequence
+from warpslam.synthetic import (
+    ALTERATIONS,
+    GAP_KINDS,
+    SEQUENCE_KINDS,
+    altered,
+    contact_sheet,
+    make_sequence,
+    write_sequence,
+)
 
 _FOCAL = 250.0 / 320.0
 """Focal length over width: a field of view of 65 degrees."""
@@ -28,10 +36,19 @@ def add(commands: Any) -> None:
     sequence = add_command(parts, "sequence", _sequence, "an RGB-D sequence with its truth, as a folder")
     sequence.add_argument("-o", "--output", required=True, metavar="DIR", help="folder; must not hold frames yet")
     sequence.add_argument("--kind", choices=SEQUENCE_KINDS, default="room", help="what happens in it (room)")
-    sequence.add_argument("--frames", type=int, metavar="N", help="number of frames (120, moving 100, gap 220)")
+    sequence.add_argument("--frames", type=int, metavar="N", help="number of frames (by kind: 58 to 220)")
     sequence.add_argument("--size", type=_size, default=(320, 240), metavar="WxH", help="image size [px] (320x240)")
     sequence.add_argument("--seed", type=int, default=0, help="seed of the room, the path and the object (0)")
     sequence.add_argument("--gap", choices=GAP_KINDS, default="black", help="what becomes of lost frames (black)")
+    sequence.add_argument(
+        "--with",
+        dest="alterations",
+        choices=tuple(ALTERATIONS),
+        nargs="+",
+        default=[],
+        metavar="WHAT",
+        help="what goes wrong, one after another: " + ", ".join(ALTERATIONS),
+    )
     add_device_option(sequence)
 
     sheet = add_command(parts, "sheet", _sheet, "a contact sheet of random rooms, as PNG")
@@ -54,9 +71,10 @@ def _sequence(options: argparse.Namespace) -> int:
     width, height = options.size
     focal = _FOCAL * width
     camera = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
-    sequence = make_sequence(
+    made = make_sequence(
         options.kind, options.seed, options.frames, intrinsics=camera, gap=options.gap, device=options.device
     )
+    sequence = altered(made, options.alterations)
     write_sequence(sequence, options.output)
     print(f"wrote {len(sequence)} frames; run them with")
     print(f"  warpslam run {options.output} --preset default --truth-mesh {options.output}/mesh.ply")

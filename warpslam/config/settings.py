@@ -356,22 +356,22 @@ class Config(_Group):
         for override in overrides:
             merge(changes, parse_override(override))
         values = self.model_dump()
-        if self.tracking.use_given_poses:
-            derived = {name: MappingConfig.model_fields[name].default for name in _FOLLOW_GIVEN_POSES}
-            tracked = Config.from_dict(_merged(values, changes)).tracking
-            if not tracked.use_given_poses:
-                merge(values, {"mapping": derived})
+        tracked = Config.from_dict(_merged(values, changes)).tracking
+        if self.tracking.use_given_poses and not tracked.use_given_poses:
+            merge(values, {"mapping": {name: MappingConfig.model_fields[name].default for name in _FOLLOW_GIVEN_POSES}})
+        elif self.tracking.optimizer == "direct" != tracked.optimizer:
+            merge(values, {"mapping": {"bundle_adjustment": MappingConfig.model_fields["bundle_adjustment"].default}})
         return self.from_dict(_merged(values, changes))
 
     def resolved(self) -> Config:
         """These settings with all that follows from others written out: what a `Slam` runs with.
 
         Poses that are given stay as they are and can be believed, so there is no bundle adjustment, and new features
-        start from the measured depth unless that is off.
+        start from the measured depth unless that is off. With direct registration the tracker refines keyframes itself.
         """
         given, mapping = self.tracking.use_given_poses, self.mapping
         derived = {
-            "bundle_adjustment": mapping.bundle_adjustment and not given,
+            "bundle_adjustment": mapping.bundle_adjustment and not given and self.tracking.optimizer != "direct",
             "depth_start": given if mapping.depth_start is None else mapping.depth_start,
         }
         return self.model_copy(update={"mapping": mapping.model_copy(update=derived)})

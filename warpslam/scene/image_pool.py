@@ -118,6 +118,11 @@ class ImagePool:
         self._kept.append(CompactImage.of(rgb, *_quantized(depth)))
         return len(self._kept) - 1
 
+    def add_kept(self, rgb: np.ndarray, units: np.ndarray, scale: float) -> int:
+        """Keep an image as `current` returned it for `bring`; returns its number."""
+        self._kept.append(CompactImage.of(rgb, units, scale))
+        return len(self._kept) - 1
+
     def keep_current(self) -> int:
         """Keep the image of slot 0 for `bring`; returns its number."""
         current = self.current()

@@ -10,13 +10,15 @@ from PIL import Image
 
 from warpslam.camera import Intrinsics
 from warpslam.errors import ConfigError
+from warpslam.synthetic.attacks import AlteredSequence
 from warpslam.synthetic.gap import GapSequence
+from warpslam.synthetic.hard_scenes import HARD_SCENES, HardScene
 from warpslam.synthetic.moving import MovingObjectSequence
 from warpslam.synthetic.sequence import DEFAULT_INTRINSICS, SyntheticSequence, write_replica
 
-Truthful = SyntheticSequence | MovingObjectSequence | GapSequence
+Truthful = SyntheticSequence | MovingObjectSequence | GapSequence | HardScene | AlteredSequence
 
-SEQUENCE_KINDS = ("room", "moving", "gap")
+SEQUENCE_KINDS = ("room", "moving", "gap", *HARD_SCENES)
 
 
 def make_sequence(
@@ -31,7 +33,8 @@ def make_sequence(
     """A sequence by the name of its kind.
 
     Args:
-        kind: "room" (a static room), "moving" (an object moves through the view) or "gap" (frames are lost).
+        kind: "room" (a static room), "moving" (an object moves through the view), "gap" (frames are lost), or one of
+            `HARD_SCENES`.
         seed: Seed of the room, the path and the object.
         frame_count: Number of frames; by default the kind's own. Of "gap" the middle 100 are lost, or the middle half
             of fewer than 200.
@@ -56,6 +59,8 @@ def make_sequence(
             seed, count, gap_start=(count - length) // 2, gap_length=length, kind=gap, intrinsics=intrinsics,
             path_seed=seed, device=device,
         )  # fmt: skip
+    if kind in HARD_SCENES:
+        return HardScene(kind, frame_count, seed=seed, intrinsics=intrinsics, device=device)
     raise ConfigError(f"kind = {kind!r} of sequence is unknown; choose one of {', '.join(SEQUENCE_KINDS)}")
 
 
@@ -71,7 +76,8 @@ def write_sequence(sequence: Truthful, folder: str | Path, *, progress: Callable
     """
     folder = Path(folder)
     write_replica(sequence, folder, progress=progress)
-    sequence.mesh.export(folder / "mesh.ply")
+    if sequence.mesh is not None:
+        sequence.mesh.export(folder / "mesh.ply")
     np.savetxt(folder / "timestamps.txt", [sequence.timestamp(index) for index in range(len(sequence))], fmt="%.9f")
     if isinstance(sequence, GapSequence):
         np.savetxt(folder / "lost.txt", sequence.is_lost, fmt="%d")

@@ -7,33 +7,49 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from scipy.spatial.transform import Rotation, Slerp
 
 from warpslam.camera import Intrinsics
 from warpslam.errors import DatasetError, InputError
 from warpslam.sequences.base import Frame, RgbdSequence
 from warpslam.synthetic.camera_path import room_trajectory
 from warpslam.synthetic.noise import sensor_noise
-from warpslam.synthetic.render import MeshRenderer
+from warpslam.synthetic.render import AntialiasedRenderer, MeshRenderer
 from warpslam.synthetic.rooms import make_room
 
 DEFAULT_INTRINSICS = Intrinsics(fx=250.0, fy=250.0, cx=159.5, cy=119.5, width=320, height=240)
 REPLICA_DEPTH_SCALE = 6553.5
 FRAME_RATE = 30.0
+BLUR_VIEWS = 8
+"""Views whose mean is an image with motion blur."""
 
 
 class RenderedSequence(RgbdSequence):
     """Views of a mesh along a path, rendered when they are asked for.
 
     noise_seed: None = exact depth, else frame i's depth carries `sensor_noise` that depends on (noise_seed, i) only.
+    exposure: Shutter time over the time between two frames; above 0, colour has motion blur.
+    depth_range: Depth beyond is missing [m], while its colour is seen; None = all is measured.
     warp_modules: Modules of kernels that rendering needs, beside those of SLAM.
     """
 
     warp_modules = ("warpslam.kernels.raycast",)
 
-    def __init__(self, name: str, renderer: MeshRenderer, poses: np.ndarray, *, noise_seed: int | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        renderer: MeshRenderer | AntialiasedRenderer,
+        poses: np.ndarray,
+        *,
+        noise_seed: int | None = None,
+        exposure: float = 0.0,
+        depth_range: float | None = None,
+    ) -> None:
         self.name = name
         self.intrinsics = renderer.intrinsics
         self.noise_seed = noise_seed
+        self.exposure = exposure
+        self.depth_range = depth_range
         self._renderer = renderer
         self._poses = np.asarray(poses, dtype=np.float64)
 
@@ -45,9 +61,26 @@ class RenderedSequence(RgbdSequence):
             raise IndexError(f"{self.name}: frame {index} of {len(self)}")
         index %= len(self)
         rgb, depth = self._renderer.render(self._poses[index])
+        if self.exposure > 0.0:
+            views = [self._renderer.render(pose)[0] for pose in self._exposed_poses(index)]
+            rgb = np.rint(np.mean(views, axis=0, dtype=np.float32)).astype(np.uint8)
+        if self.depth_range is not None:
+            depth[depth > self.depth_range] = 0.0
         if self.noise_seed is not None:
             depth = sensor_noise(depth, np.random.default_rng((self.noise_seed, index)), self.intrinsics)
         return Frame(index, self.timestamp(index), rgb, depth, self._poses[index].copy())
+
+    def _exposed_poses(self, index: int) -> np.ndarray:
+        """Poses while the shutter is open, a `BLUR_VIEWS`-th of that time apart, around the frame's own."""
+        near = np.clip([index - 1, index, index + 1], 0, len(self) - 1)
+        # At the ends of the path the camera is taken to stand still on the outer side.
+        knots = np.array([-1.0, 0.0, 1.0])
+        turn = Slerp(knots, Rotation.from_matrix(self._poses[near, :3, :3]))
+        times = self.exposure * ((np.arange(BLUR_VIEWS) + 0.5) / BLUR_VIEWS - 0.5)
+        poses = np.tile(np.eye(4), (BLUR_VIEWS, 1, 1))
+        poses[:, :3, :3] = turn(times).as_matrix()
+        poses[:, :3, 3] = np.stack([np.interp(times, knots, self._poses[near, axis, 3]) for axis in range(3)], axis=1)
+        return poses
 
     def timestamp(self, index: int) -> float:
         """Time of a frame [s]."""

@@ -34,7 +34,7 @@ class Material:
         color = self.colors[0] * (1 - mix) + self.colors[1] * mix
         # Two octaves at fixed sizes give every surface gradients to track, whatever the size of its pattern.
         seed = self.phase[0]
-        shade = _value_noise(points / 0.45 + 7.3 * seed) + 0.7 * _value_noise(points / 0.16 + 3.1 * seed) - 0.85
+        shade = value_noise(points / 0.45 + 7.3 * seed) + 0.7 * value_noise(points / 0.16 + 3.1 * seed) - 0.85
         return np.clip(color * (1 + self.noise * shade[:, None]), 0.0, 1.0).astype(np.float32)
 
 
@@ -90,7 +90,7 @@ def _stripes(cells: np.ndarray) -> np.ndarray:
 
 
 def _blotches(cells: np.ndarray) -> np.ndarray:
-    return 1.0 / (1.0 + np.exp(-12.0 * (_value_noise(1.2 * cells) - 0.5)))
+    return 1.0 / (1.0 + np.exp(-12.0 * (value_noise(1.2 * cells) - 0.5)))
 
 
 def _bricks(cells: np.ndarray) -> np.ndarray:
@@ -102,7 +102,7 @@ def _bricks(cells: np.ndarray) -> np.ndarray:
 
 
 def _wood(cells: np.ndarray) -> np.ndarray:
-    bend = _value_noise(0.6 * cells)
+    bend = value_noise(0.6 * cells)
     return 0.5 + 0.5 * np.sin(2 * np.pi * (cells[:, 0] + 0.25 * cells[:, 1] + 0.4 * cells[:, 2] + 1.5 * bend))
 
 
@@ -136,7 +136,7 @@ def _hash(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     return h * (1.0 / 2**32)
 
 
-def _value_noise(points: np.ndarray) -> np.ndarray:
+def value_noise(points: np.ndarray) -> np.ndarray:
     """Trilinear blend of hashed lattice values, in [0, 1], shape (N,)."""
     low = np.floor(points)
     t = points - low

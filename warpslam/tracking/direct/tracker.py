@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import warp as wp
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import NO_MOTION, FrameMotion, Intrinsics
 from warpslam.config import DirectConfig
-from warpslam.frames import AdmittedFrame, FrameStatus
+from warpslam.frames import AdmittedFrame
 from warpslam.kernels.direct import equations as eq
 from warpslam.kernels.direct import points, registration
 from warpslam.poses import inverse, motion_between, motion_of, orthonormalized, twist_of
@@ -28,7 +28,7 @@ from warpslam.tracking.direct.measures import Measures
 from warpslam.tracking.direct.pyramid import PyramidPlan
 from warpslam.tracking.direct.registrar import Floors, Registrar, new_tasks
 from warpslam.tracking.direct.window import Pose, refine_window
-from warpslam.trajectory import FrameHistory, Located
+from warpslam.trajectory import TWIST_STEPS, FrameHistory, Located
 
 RECENT = 4
 """Rows of images for frames that are no keyframes (yet)."""
@@ -44,8 +44,6 @@ MAX_JOINT_STEP, MAX_JOINT_TURN = 0.1, 5.0
 """Further than this [m], [degrees] the joint registration must not take a pose."""
 SCRATCH = 0
 """Row of points that hold no keyframe's."""
-TWIST_STEPS = 2
-"""Frames back to where the camera's velocity is taken from: over one, an error of a pose feeds back into the next."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +75,39 @@ class _Anchor:
     T_keyframe_frame: np.ndarray
 
 
+@dataclass(frozen=True)
+class _Before:
+    """The last frame that was OK, as it may yet become a keyframe."""
+
+    index: int
+    rgb: np.ndarray
+    depth: np.ndarray
+    kept: tuple[np.ndarray, np.ndarray, float] | None
+    """Its images as the pool held them; None where they are on a GPU."""
+
+
+@dataclass(frozen=True)
+class DirectState:
+    """All that the next frame depends on beside poses and images, for N frames."""
+
+    anchors: np.ndarray
+    """Keyframe that a frame hangs on, -1 = none, int64 (N,)."""
+    relative: np.ndarray
+    """T_keyframe_frame, float64 (N, 4, 4)."""
+    overlap: np.ndarray
+    """Share of each keyframe that the last frame sees, float64 (keyframes,); NaN = not looked at."""
+    reference: int
+    """Keyframe that frames are registered to."""
+    before: int
+    """The last frame that was OK, -1 = none."""
+    typical: tuple[float, float]
+    """Running means of the photometric scale and of the cost; infinite = none yet."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Those that are arrays, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+
+
 class DirectTracker:
     """Finds the pose of the frame in slot 0 of the image pool, and makes keyframes.
 
@@ -106,15 +137,14 @@ class DirectTracker:
         self.registrar = Registrar(self.plan, RECENT + CACHED, max_depth, floors, device)
         self._row_of: OrderedDict[int, int] = OrderedDict()  # by frame, the one used longest ago first
         self._anchors: list[_Anchor | None] = []
-        self._offsets: dict[int, float] = {}
-        self._twists: dict[int, np.ndarray] = {}
+        self._motions: dict[int, FrameMotion] = {}  # of the latest frames
         self._smallest: list[np.ndarray] = []
         self._mean_depth: list[float] = []
         self._overlap: dict[int, float] = {}  # with the last frame, by keyframe
         self._reference = 0
         self._typical_scale = np.inf
         self._typical_cost = np.inf
-        self._before: tuple[int, np.ndarray, np.ndarray] | None = None  # frame and images of the last that was OK
+        self._before: _Before | None = None
         self._rotations = rotation_grid(config.search_span)
         self.counts = {"sure": 0, "searched": 0}
 
@@ -122,18 +152,20 @@ class DirectTracker:
 
     def place(self, frame: AdmittedFrame, pose: np.ndarray) -> None:
         """A frame whose pose is given; it becomes a keyframe."""
+        self._build_missing()
         self._load(frame)
-        self._settle(frame, None)
-        self._add_keyframe(frame.index, pose, frame.rgb, frame.depth)
+        self._set_motion(frame.index, FrameMotion(depth_offset=frame.depth_offset, readout=self.readout))
+        self._add_keyframe(frame.index, pose, self.images.keep_current())
+        self._note(frame)
 
     def locate(self, frame: AdmittedFrame, history: FrameHistory) -> Located:
         """Pose of the frame, which comes after the frames of ``history``."""
+        self._build_missing()
         row = self._load(frame)
-        self._foretell_motion(row, frame, history)
+        self._foretell_motion(frame, history)
         starts = history.starts(constant_speed=True)
-        if not self.keyframes or (not starts and not history.was_known):
-            if not self.keyframes:
-                return Located(np.eye(4), "there is no keyframe to compare with")
+        if not self.keyframes:
+            return Located(np.eye(4), "it is not known where the camera starts: there is no keyframe to compare with")
         best: Attempt | None = None
         done: tuple[Attempt, np.ndarray, np.ndarray] | None = None
         if history.was_known:
@@ -165,7 +197,7 @@ class DirectTracker:
         reference = self.keyframes[attempt.keyframe]
         pose = orthonormalized(reference.pose @ inverse(T_frame_reference))
         self._settle(frame, _Anchor(attempt.keyframe, inverse(reference.pose) @ pose))
-        self._note_motion(row, frame, pose, history)
+        self._note_motion(frame, pose, history)
         anchor = self._anchors[frame.index]
         assert anchor is not None
         pose = reference.pose @ anchor.T_keyframe_frame
@@ -183,7 +215,7 @@ class DirectTracker:
             if old is not None:
                 self._reference = old
             else:
-                self._add_keyframe(frame.index, pose, frame.rgb, frame.depth)
+                self._add_keyframe(frame.index, pose, self.images.keep_current())
                 self._refine(history)
                 located = Located(
                     self.keyframes[-1].pose.copy(),
@@ -320,7 +352,7 @@ class DirectTracker:
             best = _better(best, found, by_cost=True)
             if best is not None and self._is_good(best):
                 return best
-            if history.was_known and self._before is not None and self._before[0] != self._reference_frame:
+            if history.was_known and self._before is not None and self._before.index != self._reference_frame:
                 self._keep_before(history)
                 found = self._search(row, self._points_of(self._reference), self._reference, poses, None)
                 best = _better(best, found)
@@ -330,10 +362,8 @@ class DirectTracker:
 
     def _turned(self, row: int, starts: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Starts whose rotation was found on the smallest images of the frame before."""
-        if self._before is None or not starts:
-            return []
-        before = self._row_of.get(self._before[0])
-        if before is None:
+        before = self._row_before()
+        if before is None or not starts:
             return []
         rotations = self._best_rotations(self.registrar.smallest(before)[None], row, self.config.search_kept)[0]
         last = starts[-1]
@@ -470,28 +500,44 @@ class DirectTracker:
         far = 0.8 * config.keyframe_step * self.registrar.mean_depth(row)
         return best[0] if step < far and turn < 0.8 * config.keyframe_turn else None
 
-    def _add_keyframe(self, index: int, pose: np.ndarray, rgb: np.ndarray, depth: np.ndarray) -> int:
-        """Make a frame whose images are loaded a keyframe, and the reference; its number."""
+    def _add_keyframe(self, index: int, pose: np.ndarray, image: int) -> None:
+        """Make a frame whose pyramid is built a keyframe, and the reference; ``image``: its number in the pool."""
         number = len(self.keyframes)
-        row = self._row_of[index]
-        self.registrar.select(row, self._points_of(number))
-        self.keyframes.append(Keyframe(index, self.images.add(rgb, depth), orthonormalized(pose)))
-        self._smallest.append(self.registrar.smallest(row))
-        self._mean_depth.append(self.registrar.mean_depth(row))
+        motion = self._motions.get(index, NO_MOTION)
+        self.keyframes.append(Keyframe(index, image, orthonormalized(pose), motion))
+        self._take_up(number)
         self._anchors[index] = _Anchor(number, np.eye(4))
         self._overlap[number] = 1.0
         self._reference = number
-        return number
+
+    def _take_up(self, number: int) -> None:
+        """Choose the points of a keyframe."""
+        row = self._row(self.keyframes[number])
+        self.registrar.select(row, self._points_of(number))
+        self._smallest.append(self.registrar.smallest(row))
+        self._mean_depth.append(self.registrar.mean_depth(row))
+
+    def _build_missing(self) -> None:
+        """Take up keyframes that came from elsewhere: a file, or frames whose poses were given."""
+        for number in range(len(self._smallest), len(self.keyframes)):
+            self._take_up(number)
 
     def _keep_before(self, history: FrameHistory) -> None:
         """The last frame that was OK becomes a keyframe: it is what a lost camera is nearest to."""
+        before = self._before
+        if before is None or self._row_before() is None or before.index in (one.index for one in self.keyframes):
+            return
+        image = self.images.add(before.rgb, before.depth) if before.kept is None else self.images.add_kept(*before.kept)
+        self._add_keyframe(before.index, history.pose(before.index), image)
+
+    def _row_before(self) -> int | None:
+        """Where the images of the last frame that was OK are; None if they are gone."""
         if self._before is None:
-            return
-        index, rgb, depth = self._before
-        anchor = self._anchors[index]
-        if anchor is None or self.keyframes[anchor.keyframe].index == index or index not in self._row_of:
-            return
-        self._add_keyframe(index, history.pose(index), rgb, depth)
+            return None
+        index = self._before.index
+        if index in self._row_of:
+            return self._row_of[index]
+        return next((self._row(one) for one in reversed(self.keyframes) if one.index == index), None)
 
     def _refine(self, history: FrameHistory) -> None:
         """Refine the keyframes around the newest, and move the frames that hang on them."""
@@ -553,10 +599,9 @@ class DirectTracker:
         return self.keyframes[attempt.keyframe].pose @ inverse(attempt.T_frame_keyframe)
 
     def _load(self, frame: AdmittedFrame) -> int:
-        self._offsets[frame.index] = frame.depth_offset
         row = self._take_row(frame.index)
         rgb, depth, scale = self.images.arrays
-        self.registrar.load(row, rgb[0], depth[0], scale)
+        self.registrar.load(row, rgb[0], depth[0], scale[:1])
         while len(self._anchors) <= frame.index:
             self._anchors.append(None)
         return row
@@ -567,17 +612,19 @@ class DirectTracker:
         if row is not None:
             self._row_of.move_to_end(keyframe.index)
             return row
-        row = self._take_row(keyframe.index)
-        rgb, units, scale = self.images.kept(keyframe.image).unpack(self.camera)
-        device = self.device
+        row = self._upload(keyframe.index, *self.images.kept(keyframe.image).unpack(self.camera))
+        self._set_motion(keyframe.index, keyframe.motion)
+        return row
+
+    def _upload(self, index: int, rgb: np.ndarray, units: np.ndarray, scale: float) -> int:
+        """Build the pyramid of an image that is kept."""
+        row, device = self._take_row(index), self.device
         self.registrar.load(
             row,
             wp.array(rgb, dtype=wp.uint8, device=device),
             wp.array(units, dtype=wp.uint16, device=device),
             wp.array([scale], dtype=float, device=device),
         )
-        if keyframe.index in self._twists:
-            self._set_motion(row, keyframe.index, self._twists[keyframe.index])
         return row
 
     def _take_row(self, index: int) -> int:
@@ -594,89 +641,114 @@ class DirectTracker:
         self._anchors[frame.index] = anchor
 
     def _note(self, frame: AdmittedFrame) -> None:
-        self._before = frame.index, frame.rgb.copy(), frame.depth.copy()
+        kept = self.images.current() if self.device.is_cpu else None
+        self._before = _Before(frame.index, frame.rgb if kept else frame.rgb.copy(), frame.depth, kept)
+
+    # -- saved ---------------------------------------------------------------------------------------------------
+
+    def state(self) -> DirectState:
+        """All of it as arrays."""
+        anchors = [-1 if anchor is None else anchor.keyframe for anchor in self._anchors]
+        relative = [np.eye(4) if anchor is None else anchor.T_keyframe_frame for anchor in self._anchors]
+        return DirectState(
+            anchors=np.array(anchors, np.int64),
+            relative=np.array(relative, np.float64).reshape(-1, 4, 4),
+            overlap=np.array([self._overlap.get(k, np.nan) for k in range(len(self.keyframes))], np.float64),
+            reference=self._reference,
+            before=-1 if self._before is None else self._before.index,
+            typical=(self._typical_scale, self._typical_cost),
+        )
+
+    def restore(self, state: DirectState, current: int | None, motion: FrameMotion) -> None:
+        """Go on from what `state` returned; keyframes and images are restored already.
+
+        current: The frame in slot 0. motion: How the camera moved meanwhile.
+        """
+        pairs = zip(state.anchors.tolist(), state.relative, strict=True)
+        self._anchors = [None if k < 0 else _Anchor(k, T.copy()) for k, T in pairs]
+        self._overlap = {k: share for k, share in enumerate(state.overlap.tolist()) if np.isfinite(share)}
+        self._reference = state.reference
+        self._typical_scale, self._typical_cost = state.typical
+        if state.before < 0:
+            return
+        rgb, units, scale = self.images.current()
+        depth = units.astype(np.float32) * np.float32(scale)
+        self._before = _Before(state.before, rgb, depth, (rgb, units, scale))
+        if state.before == current:
+            self._upload(state.before, rgb, units, scale)
+            self._set_motion(state.before, motion)
 
     # -- motion within a frame -----------------------------------------------------------------------------------
 
-    def _is_timed(self, frame: AdmittedFrame) -> bool:
-        return frame.depth_offset != 0.0 or self.readout != 0.0
+    @property
+    def motion(self) -> FrameMotion:
+        """How the camera moved while it took the last frame, as far as is known by now."""
+        return self._motions[max(self._motions)] if self._motions else NO_MOTION
 
-    def _foretell_motion(self, row: int, frame: AdmittedFrame, history: FrameHistory) -> None:
+    def _set_motion(self, index: int, motion: FrameMotion) -> None:
+        """How the camera moved while it took a frame whose images are loaded."""
+        self._motions[index] = motion
+        while len(self._motions) > RECENT:
+            del self._motions[min(self._motions)]
+        struct = np.zeros(1, points.Motion.numpy_dtype())
+        twist = np.array(motion.twist)
+        struct["to_depth"] = motion_of(-motion.depth_offset * twist)
+        struct["velocity"], struct["spin"] = motion.readout * twist[:3], motion.readout * twist[3:]
+        struct["moves"] = not motion.is_none
+        self.registrar.set_motion(self._row_of[index], struct)
+
+    def _foretell_motion(self, frame: AdmittedFrame, history: FrameHistory) -> None:
         """The camera moves during this frame as it did between the last ones."""
-        last = len(history) - 1
-        earlier = self._earlier(history, last)
-        if self._is_timed(frame) and earlier is not None:
-            elapsed = history.timestamp(last) - history.timestamp(earlier)
-            self._set_motion(row, frame.index, twist_of(inverse(history.pose(earlier)) @ history.pose(last)) / elapsed)
-
-    def _set_motion(self, row: int, index: int, twist: np.ndarray) -> None:
-        """How the camera moved, (v, w) [m/s, rad/s] in its own axes, while it took the frame in ``row``."""
-        motion = np.zeros(1, points.Motion.numpy_dtype())
-        motion["to_depth"] = motion_of(-self._offsets[index] * twist)
-        motion["velocity"], motion["spin"] = self.readout * twist[:3], self.readout * twist[3:]
-        motion["moves"] = 1
-        self._twists[index] = twist
-        self.registrar.set_motion(row, motion)
-
-    def _earlier(self, history: FrameHistory, last: int) -> int | None:
-        """A frame some steps before one that the camera has come from without a break; None if there is none."""
-        first = last
-        while first > max(0, last - TWIST_STEPS) and history.status(first - 1) is FrameStatus.OK:
-            first -= 1
-        if last < 0 or first == last or history.status(last) is not FrameStatus.OK:
-            return None
-        return first if history.timestamp(last) > history.timestamp(first) else None
+        motion = FrameMotion(depth_offset=frame.depth_offset, readout=self.readout)
+        self._set_motion(frame.index, motion.with_twist(history.twist()))
 
     def _ask_motion(self, joint: np.ndarray, frame: AdmittedFrame, history: FrameHistory, W: np.ndarray) -> None:
         """Have the joint registration correct the motion by the pose that it begins with."""
-        last = frame.index - 1
-        if not self._is_timed(frame) or last < 0 or history.status(last) is not FrameStatus.OK:
+        earlier = history.earlier(TWIST_STEPS - 1)
+        if (frame.depth_offset == 0.0 and self.readout == 0.0) or earlier is None:
             return
-        earlier = last
-        while earlier > max(0, frame.index - TWIST_STEPS) and history.status(earlier - 1) is FrameStatus.OK:
-            earlier -= 1
         joint["T_earlier_reference"] = inverse(history.pose(earlier)) @ W
-        joint["elapsed"] = frame.timestamp - history.timestamp(earlier)
+        joint["elapsed"] = max(frame.timestamp - history.timestamp(earlier), 0.0)
         joint["delay"], joint["readout"] = frame.depth_offset, self.readout
 
-    def _note_motion(self, row: int, frame: AdmittedFrame, pose: np.ndarray, history: FrameHistory) -> None:
+    def _note_motion(self, frame: AdmittedFrame, pose: np.ndarray, history: FrameHistory) -> None:
         """The motion during a frame that was located, and during the keyframe before it, now seen from both sides."""
-        i = frame.index
-        if not self._is_timed(frame) or i < 1 or history.status(i - 1) is not FrameStatus.OK:
+        earlier = history.earlier(TWIST_STEPS - 1)
+        motion = self._motions[frame.index]
+        if (motion.depth_offset == 0.0 and motion.readout == 0.0) or earlier is None:
             return
-        earlier = max(0, i - TWIST_STEPS)
-        if history.status(earlier) is not FrameStatus.OK:
-            earlier = i - 1
         elapsed = frame.timestamp - history.timestamp(earlier)
         if elapsed <= 0:
             return
         twist = twist_of(inverse(history.pose(earlier)) @ pose) / elapsed
-        self._set_motion(row, i, twist)
-        number = len(self.keyframes) - 1
-        if i == TWIST_STEPS and number == 0:
-            self._begin_again(row, frame, twist, history)
-        elif i >= TWIST_STEPS and self.keyframes[number].index == i - 1 and earlier == i - 2:
-            self._correct_keyframe(number, twist)
+        self._set_motion(frame.index, motion.with_twist(twist))
+        last = self.keyframes[-1]
+        if earlier != frame.index - TWIST_STEPS:
+            return
+        if len(self.keyframes) == 1 and last.index == earlier and not history.follows(earlier):
+            self._begin_again(frame, twist, history)
+        elif last.index == frame.index - 1:
+            self._correct_keyframe(len(self.keyframes) - 1, twist)
 
     def _correct_keyframe(self, number: int, twist: np.ndarray) -> None:
+        """Choose a keyframe's points anew for another motion."""
         keyframe = self.keyframes[number]
+        keyframe.motion = keyframe.motion.with_twist(twist)
         row = self._row(keyframe)
-        self._set_motion(row, keyframe.index, twist)
+        self._set_motion(keyframe.index, keyframe.motion)
         self.registrar.select(row, self._points_of(number))
 
-    def _begin_again(self, row: int, frame: AdmittedFrame, twist: np.ndarray, history: FrameHistory) -> None:
+    def _begin_again(self, frame: AdmittedFrame, twist: np.ndarray, history: FrameHistory) -> None:
         """The first keyframe gets its motion from the two frames after it, and these are registered once more."""
         self._correct_keyframe(0, twist)
         W = self.keyframes[0].pose
-        del row
-        for index in (1, frame.index):
-            at = self._row_of.get(index)
+        for index in range(self.keyframes[0].index + 1, frame.index + 1):
             anchor = self._anchors[index]
-            if at is None or anchor is None or anchor.keyframe != 0:
+            if index not in self._row_of or index not in self._motions or anchor is None or anchor.keyframe != 0:
                 continue
-            self._set_motion(at, index, twist)
+            self._set_motion(index, self._motions[index].with_twist(twist))
             task = self._task()
-            task["keyframe"], task["row"], task["top"] = self._points_of(0), at, self.judged
+            task["keyframe"], task["row"], task["top"] = self._points_of(0), self._row_of[index], self.judged
             task["T"] = inverse(anchor.T_keyframe_frame)
             result = self.registrar.register(task)[0]
             if result["ok"]:
