@@ -18,6 +18,7 @@ TWIST = (0.3, -0.2, 0.2, 0.2, -0.4, 0.2)
 RATE = 15.0
 TIMING = SensorTiming(-0.02, 0.03)
 SETTINGS = [
+    "tracking.optimizer=gauss_newton",
     "tracking.pixels=64", "tracking.iterations=4", "tracking.ignore_edge_u=4", "tracking.ignore_edge_v=4",
     "mapping.pixels=100", "mapping.every=2", "mapping.first_iterations=20", "mapping.iterations=6",
     "mapping.coarse_iterations=1", "mapping.bundle_adjustment=false", "keyframes.every=2", "tracking.lost_inliers=0",
@@ -89,6 +90,8 @@ def test_saved_state_goes_on_exactly(tmp_path):
     run(3, given=False).save(tmp_path / "map.safetensors")
     loaded = Slam.load(tmp_path / "map.safetensors", "cpu")
     assert loaded.timing == TIMING
+    other = SensorTiming(0.01, 0.0)
+    assert Slam.load(tmp_path / "map.safetensors", "cpu", timing=other).timing == other
     half = run(3, given=False)
     for ours, theirs in zip(loaded.images.arrays, half.images.arrays, strict=True):
         np.testing.assert_array_equal(ours.numpy()[0], theirs.numpy()[0])

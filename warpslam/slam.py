@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -451,8 +452,9 @@ class Slam:
             CheckpointError: The file is missing, damaged, or of another version.
             ConfigError: ``config`` does not fit the map.
         """
-        slam = cls.from_state(read_slam(Path(path), config), device, localize_only=localize_only)
-        slam.timing = slam.timing if timing is None else timing
+        state = read_slam(Path(path), config)
+        state = state if timing is None else replace(state, timing=timing)
+        slam = cls.from_state(state, device, localize_only=localize_only)
         if localize_only:
             slam.forget_pose()
         return slam
