@@ -102,7 +102,7 @@ class FakeSlam:
         self.given: list[np.ndarray | None] = []
         self.finished = False
 
-    def step(self, rgb, depth, timestamp=None, T_world_camera=None) -> FakeResult:
+    def step(self, rgb, depth, timestamp=None, T_world_camera=None, *, depth_timestamp=None) -> FakeResult:
         index = len(self.results)
         if index == self.interrupt_at:
             raise KeyboardInterrupt

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import Intrinsics, SensorTiming
 from warpslam.errors import ConfigError
 
 CAMERA = Intrinsics(500.0, 480.0, 310.0, 245.0, 640, 480)
@@ -42,3 +42,21 @@ def test_a_camera_that_can_not_be_is_refused(name, value):
     """The field and its value are named."""
     with pytest.raises(ConfigError, match=rf"camera\.{name} = {value}"):
         Intrinsics(**{**vars(CAMERA), name: value})
+
+
+def test_sensor_timing_adds_its_delay_to_the_stamps():
+    """tau is the difference of the stamps plus the constant; without a stamp of depth the constant alone."""
+    timing = SensorTiming(depth_delay=-0.02, readout=0.026)
+    assert timing.depth_offset(10.0, 9.99) == pytest.approx(-0.03)
+    assert timing.depth_offset(10.0, None) == -0.02
+    assert SensorTiming().depth_offset(10.0, None) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("depth_delay", 0.21), ("depth_delay", -0.21), ("depth_delay", np.nan), ("readout", -1e-3), ("readout", 0.3)],
+)
+def test_sensor_timing_out_of_range(name, value):
+    """A delay or readout that no camera has, is refused by name."""
+    with pytest.raises(ConfigError, match=f"camera.{name}"):
+        SensorTiming(**{name: value})

@@ -258,6 +258,8 @@ def test_misuse_is_refused(frames):
         ({"rgb": frame.rgb.tolist()}, "rgb: expected .* list"),
         ({"depth": None}, "depth: expected .* NoneType"),
         ({"timestamp": "now"}, "timestamp = 'now'"),
+        ({"timestamp": 0.0, "depth_timestamp": "now"}, "depth_timestamp = 'now'"),
+        ({"depth_timestamp": 0.0}, "needs the timestamp"),
         ({"T_world_camera": np.zeros((4, 4))}, "rotation"),
         ({"T_world_camera": np.eye(3)}, r"shape \(3, 3\)"),
         ({"T_world_camera": [["a"]]}, "no matrix of numbers"),
@@ -306,6 +308,8 @@ def bad_frames(frame):
         "torch_type_without_numpy": ({"depth": torch.tensor(depth).bfloat16()}, "no counterpart in NumPy"),
         "sparse": ({"depth": torch.tensor(depth).to_sparse()}, "no counterpart in NumPy"),
         "time": ({"timestamp": np.nan}, "timestamp is nan"),
+        "depth_time": ({"timestamp": 0.05, "depth_timestamp": 0.7}, "depth is 0.65"),
+        "unknown_depth_time": ({"timestamp": 0.05, "depth_timestamp": np.nan}, "depth is nan"),
     }
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import Intrinsics, SensorTiming
 from warpslam.config import Config
 from warpslam.errors import CheckpointError, ConfigError, InputError, MapSizeError
 from warpslam.field.decoder_files import load_decoders
@@ -36,7 +36,9 @@ def frames():
 
 
 def run(frames, *overrides: str) -> Slam:
-    slam = Slam(CAMERA, Config.from_preset("default", [*SETTINGS, *overrides]), "cpu", decoders=load_decoders())
+    """Over images that are taken as if by a sensor with a delay and a rolling shutter."""
+    config = Config.from_preset("default", [*SETTINGS, *overrides])
+    slam = Slam(CAMERA, config, "cpu", decoders=load_decoders(), timing=SensorTiming(-0.02, 0.03))
     for frame in frames:
         slam.step(frame.rgb, frame.depth, frame.timestamp)
     return slam
@@ -92,7 +94,8 @@ def test_every_array_is_needed_and_checked(state):
     ("name", "value"),
     [
         ("seed", -1), ("seed", "1"), ("config", None), ("config", {"grid": {"margin": -1}}), ("intrinsics", {"fx": 1}),
-        ("intrinsics", None), ("current", 99), ("mapped", "x"), ("first", None), ("keyframes", [77]),
+        ("intrinsics", None), ("timing", {"readout": 9}), ("timing", None),
+        ("current", 99), ("mapped", "x"), ("first", None), ("keyframes", [77]),
         ("keyframes", 3), ("seen", [-1]),
     ],
 )  # fmt: skip

@@ -13,6 +13,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from warpslam.camera import Intrinsics as Intrinsics
+    from warpslam.camera import SensorTiming as SensorTiming
     from warpslam.config import PRESETS as PRESETS
     from warpslam.config import Config as Config
     from warpslam.errors import CheckpointError as CheckpointError
@@ -59,6 +60,7 @@ _MODULE_OF = {
     "PRESETS": "warpslam.config",
     "RenderedImage": "warpslam.field.rendering",
     "RgbdSequence": "warpslam.sequences.base",
+    "SensorTiming": "warpslam.camera",
     "Slam": "warpslam.slam",
     "Trajectory": "warpslam.trajectory",
     "WarpSlamError": "warpslam.errors",

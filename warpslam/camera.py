@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,6 +67,76 @@ class Intrinsics:
         return Intrinsics(
             self.fx, self.fy, self.cx - border, self.cy - border, self.width - 2 * border, self.height - 2 * border
         )
+
+
+MAX_DEPTH_DELAY = 0.2
+MAX_READOUT = 0.2
+
+
+@dataclass(frozen=True)
+class SensorTiming:
+    """When a camera sees what its images show; all 0 for images whose pixels are taken at one moment, as rendered ones
+    are.
+
+    The pose of a frame is that at the middle row of its colour image.
+    """
+
+    depth_delay: float = 0.0
+    """Time of depth minus that of colour [s], beyond the difference of their stamps: negative if depth is older."""
+    readout: float = 0.0
+    """Time from the first to the last row, of colour and depth alike [s]; 0 = global shutter."""
+
+    def __post_init__(self) -> None:
+        # "not <=" catches NaN.
+        if not abs(self.depth_delay) <= MAX_DEPTH_DELAY:
+            raise ConfigError(
+                f"camera.depth_delay = {self.depth_delay!r} must be -{MAX_DEPTH_DELAY} to {MAX_DEPTH_DELAY} seconds"
+            )
+        if not 0 <= self.readout <= MAX_READOUT:
+            raise ConfigError(f"camera.readout = {self.readout!r} must be 0 to {MAX_READOUT} seconds")
+
+    def depth_offset(self, timestamp: float, depth_timestamp: float | None) -> float:
+        """tau = t_depth - t_colour [s] of a frame with these stamps [s]; without a stamp of depth, the delay alone."""
+        stamped = 0.0 if depth_timestamp is None else depth_timestamp - timestamp
+        return stamped + self.depth_delay
+
+
+ONE_MOMENT = SensorTiming()
+"""All pixels of a frame are taken at once."""
+
+
+@dataclass(frozen=True)
+class FrameMotion:
+    """How the camera moved while it took a frame, and for how long it took it."""
+
+    twist: tuple[float, ...] = (0.0,) * 6
+    """u = (v, w) in the camera's axes [m/s, rad/s]: T_world_camera(t + dt) = T_world_camera(t) exp(u dt)."""
+    depth_offset: float = 0.0
+    """tau, time of the depth image minus that of the colour image [s]."""
+    readout: float = 0.0
+    """Time from the first to the last row [s]."""
+
+    @property
+    def is_none(self) -> bool:
+        """Whether images show what they would if the camera stood still."""
+        return not any(self.twist) or (self.depth_offset == 0.0 and self.readout == 0.0)
+
+    def with_twist(self, twist: np.ndarray) -> FrameMotion:
+        """The same frame, taken with another twist (6,) [m/s, rad/s]."""
+        return replace(self, twist=tuple(float(value) for value in twist))
+
+    def to_array(self) -> np.ndarray:
+        """Twist, depth_offset and readout, float64 (8,)."""
+        return np.array([*self.twist, self.depth_offset, self.readout])
+
+    @classmethod
+    def from_array(cls, values: np.ndarray) -> FrameMotion:
+        """What `to_array` gave."""
+        *twist, depth_offset, readout = values.tolist()
+        return cls(tuple(twist), depth_offset, readout)
+
+
+NO_MOTION = FrameMotion()
 
 
 def check_number(value: float, name: str) -> float:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from warpslam.camera import Intrinsics, check_number
+from warpslam.camera import ONE_MOMENT, Intrinsics, SensorTiming, check_number
 from warpslam.config import Config
 from warpslam.errors import ConfigError, FrameError, InputError
 from warpslam.poses import check_transform, orthonormalized
@@ -23,6 +23,8 @@ MIN_DEPTH_PIXELS = 100
 BLANK_SHARE = 0.99
 """An image is black or over-exposed if this share of its pixels is."""
 DARKEST, BRIGHTEST = 2, 253
+MAX_DEPTH_OFFSET = 0.5
+"""Depth is taken within this time [s] of its colour image."""
 DEFAULT_RATE = 30.0
 """Frames a second where no times are given."""
 
@@ -76,6 +78,8 @@ class AdmittedFrame:
     """z-depth [m], float32 (H, W), 0 where nothing was measured; empty where there is a fault."""
     given_pose: np.ndarray | None = None
     """Known T_world_camera, float64 (4, 4)."""
+    depth_offset: float = 0.0
+    """tau, time of the depth image minus that of the colour image [s]."""
     fault: str = ""
     """Why the frame can't be used; empty if it can."""
 
@@ -91,6 +95,8 @@ def admit(
     last_timestamp: float,
     intrinsics: Intrinsics,
     config: Config,
+    depth_timestamp: float | None = None,
+    timing: SensorTiming = ONE_MOMENT,
     colored: bool = True,
 ) -> AdmittedFrame:
     """Take in what was passed to `Slam.step`, whose arguments these are.
@@ -105,12 +111,17 @@ def admit(
         last_timestamp: Time of the frame before [s].
         intrinsics: Camera, for the size that the images should have.
         config: Settings.
+        depth_timestamp: As in `Slam.step`.
+        timing: When the camera's pixels are taken.
         colored: Whether colour is used; if not, a black image is no fault.
 
     Raises:
         InputError: Misuse, which no other frame would mend.
     """
     time = index / DEFAULT_RATE if timestamp is None else check_number(timestamp, "timestamp")
+    depth_time = None if depth_timestamp is None else check_number(depth_timestamp, "depth_timestamp")
+    if depth_time is not None and timestamp is None:
+        raise InputError(f"frame {index}: depth_timestamp = {depth_time!r} needs the timestamp of the colour image")
     given = None if T_world_camera is None else check_transform(T_world_camera, unknown_is_nan=True)
     needs_pose = config.tracking.use_given_poses
     if needs_pose and given is None:
@@ -119,6 +130,12 @@ def admit(
         rgb, depth = read_images(rgb, depth, intrinsics, config.grid.max_depth, depth_scale, colored=colored)
         if not math.isfinite(time):
             raise FrameError(f"its timestamp is {time}")
+        offset = timing.depth_offset(time, depth_time)
+        if not abs(offset) <= MAX_DEPTH_OFFSET:
+            raise FrameError(
+                f"its depth is {offset:.3g} s from its colour image (depth_timestamp); at most {MAX_DEPTH_OFFSET} s "
+                "are accepted"
+            )
         if given is not None and not np.isfinite(given).all():
             if needs_pose:
                 raise FrameError("its T_world_camera holds NaN or infinity, and tracking.use_given_poses is on")
@@ -127,7 +144,8 @@ def admit(
         time = time if math.isfinite(time) else last_timestamp
         nothing = np.zeros((0, 0, 3), np.uint8), np.zeros((0, 0), np.float32)
         return AdmittedFrame(index, time, *nothing, fault=str(error))
-    return AdmittedFrame(index, time, rgb, depth, None if given is None else orthonormalized(given))
+    pose = None if given is None else orthonormalized(given)
+    return AdmittedFrame(index, time, rgb, depth, pose, offset)
 
 
 def skipped(frame: AdmittedFrame, last_pose: np.ndarray) -> FrameResult:

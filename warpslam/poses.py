@@ -83,3 +83,52 @@ def _rotation() -> Any:
     from scipy.spatial.transform import Rotation
 
     return Rotation
+
+
+def inverse(T: np.ndarray) -> np.ndarray:
+    """Inverse of a rigid transform (4, 4), or of each of a stack (N, 4, 4)."""
+    out = np.zeros_like(T, dtype=np.float64)
+    R = np.swapaxes(T[..., :3, :3], -1, -2)
+    out[..., :3, :3] = R
+    out[..., :3, 3] = -np.einsum("...ij,...j->...i", R, T[..., :3, 3])
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def skew(w: np.ndarray) -> np.ndarray:
+    """Matrix (3, 3) of the cross product with a vector (3,)."""
+    x, y, z = w
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def motion_of(twist: np.ndarray) -> np.ndarray:
+    """Rigid transform (4, 4), exp of a twist (v, w) of shape (6,) [m, rad]."""
+    v, w = np.asarray(twist[:3], np.float64), np.asarray(twist[3:], np.float64)
+    angle, W = float(np.linalg.norm(w)), skew(w)
+    a, b, c = 1.0, 0.5, 1.0 / 6.0
+    if angle > 1e-8:
+        a = np.sin(angle) / angle
+        b, c = 2.0 * (np.sin(0.5 * angle) / angle) ** 2, (1.0 - a) / angle**2
+    T = np.eye(4)
+    T[:3, :3] += a * W + b * W @ W
+    T[:3, 3] = (np.eye(3) + b * W + c * W @ W) @ v
+    return T
+
+
+def twist_of(T: np.ndarray) -> np.ndarray:
+    """Twist (v, w) (6,) [m, rad] of a rigid transform (4, 4) of less than half a turn; the inverse of `motion_of`."""
+    w = _rotation().from_matrix(T[:3, :3]).as_rotvec()
+    angle, W = float(np.linalg.norm(w)), skew(w)
+    c = 1.0 / 12.0
+    if angle > 1e-4:
+        c = (1.0 - 0.5 * angle * np.sin(angle) / (1.0 - np.cos(angle))) / angle**2
+    v = T[:3, 3] - 0.5 * W @ T[:3, 3] + c * W @ W @ T[:3, 3]
+    return np.concatenate([v, w])
+
+
+def adjoint(T: np.ndarray) -> np.ndarray:
+    """Matrix (6, 6) that takes twists (v, w) through a rigid transform: T exp(xi) = exp(adjoint(T) xi) T."""
+    A = np.zeros((6, 6))
+    A[:3, :3] = A[3:, 3:] = T[:3, :3]
+    A[:3, 3:] = skew(T[:3, 3]) @ T[:3, :3]
+    return A

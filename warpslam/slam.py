@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 import warp as wp
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import ONE_MOMENT, FrameMotion, Intrinsics, SensorTiming
 from warpslam.config import Config
 from warpslam.errors import InputError
 from warpslam.field.complexity import field_flops, weight_count
@@ -33,9 +33,10 @@ from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.mapped_views import ObservedView, SeenDepth
 from warpslam.scene.scene_map import SceneMap
 from warpslam.slam_state import SlamState, read_slam, write_slam
+from warpslam.tracking.direct.tracker import DirectTracker
 from warpslam.tracking.localizer import Localizer
 from warpslam.tracking.tracker import Tracker
-from warpslam.trajectory import FrameHistory, Located, Trajectory
+from warpslam.trajectory import TWIST_STEPS, FrameHistory, Located, Trajectory
 
 if TYPE_CHECKING:
     import trimesh
@@ -51,7 +52,7 @@ class Slam:
         slam.mesh().export("mesh.ply")
 
     Its parts: ``scene`` (the map), ``history`` (what became of every frame), ``keyframes``, ``images`` (theirs, and the
-    current frame's), ``tracker`` and ``localizer``, ``mapper`` and ``scheduler``.
+    current frame's), ``direct`` (or ``tracker`` and ``localizer``), ``mapper`` and ``scheduler``.
 
     Args:
         intrinsics: Camera of all frames.
@@ -60,6 +61,7 @@ class Slam:
         seed: Of the initial features and of every random choice. Same input, seed and number of CPU cores: same result
             on the CPU (with the strict schedule).
         decoders: Decoder weights; by default those of `Config.decoders`, and failing that the package's own.
+        timing: When the camera's pixels are taken; `Config.sensor_timing` off = all at once.
     """
 
     has_checkpoints: ClassVar[bool] = True
@@ -72,11 +74,13 @@ class Slam:
         seed: int = 0,
         *,
         decoders: Decoders | None = None,
+        timing: SensorTiming = ONE_MOMENT,
     ) -> None:
         self.intrinsics = intrinsics
         self.config = (config if config is not None else Config()).resolved()
         check_settings(intrinsics, self.config)
         check_window_fits(intrinsics, self.config.keyframes.max_gigabytes, self.config.mapping.window)
+        self.timing = timing
         self.device = wp.get_device(device)
         self.seed = seed
         start = time.perf_counter()
@@ -89,6 +93,7 @@ class Slam:
         self.tracker = Tracker(intrinsics, self.config.tracking, self.config.sampling, self.device, seed)
         self.localizer = Localizer(self.tracker, self.config.tracking, intrinsics)
         self.mapper = Mapper(self.scene, intrinsics, self.config.mapping, self.config.sampling, self.device, seed)
+        self.direct = self._direct_tracker()
         self.scheduler = new_scheduler(self.config.schedule, self.mapper, self.images)
         self._seen: list[SeenDepth] = []
         self._current: int | None = None
@@ -104,6 +109,7 @@ class Slam:
         T_world_camera: np.ndarray | None = None,
         *,
         depth_scale: float | None = None,
+        depth_timestamp: float | None = None,
     ) -> FrameResult:
         """Take in one frame.
 
@@ -116,17 +122,18 @@ class Slam:
                 `forget_pose`, and for every frame with `TrackingConfig.use_given_poses`. One that is not finite counts
                 as unknown.
             depth_scale: Units per metre of integer depth, for example 1000 or 5000.
+            depth_timestamp: Time of the depth image [s], where it has one of its own; ``timestamp`` is colour's.
 
         A bad frame raises nothing: arrays of another size or type, too few pixels with depth, a black or over-exposed
-        image, a time that is not finite, or a pose that is not finite where one is needed give the status SKIPPED and
-        a message, and leave the map as it was.
+        image, a time that is not finite, depth stamped more than half a second from colour, or a pose that is not
+        finite where one is needed give the status SKIPPED and a message, and leave the map as it was.
 
         Raises:
             InputError: Misuse, which no other frame would mend: an argument that is no array, integer depth without
                 ``depth_scale``, a T_world_camera that is no rigid transform, or none where one is needed.
             MapSizeError: The map would outgrow the memory set for it.
         """
-        frame = self._admit(rgb, depth, timestamp, T_world_camera, depth_scale)
+        frame = self._admit(rgb, depth, timestamp, T_world_camera, depth_scale, depth_timestamp)
         if frame.fault:
             self.history.skip(frame.timestamp)
             return skipped(frame, self.history.last_pose)
@@ -135,6 +142,7 @@ class Slam:
         self._make_current(frame)
         located = self._locate(frame, account)  # Sec. 3.3, Eq. 11-12
         self.history.add(frame.timestamp, located)
+        self._note_motion(frame)  # what is mapped and kept are images of one moment
         if located.status is FrameStatus.OK and self.config.mapping.enabled:
             is_keyframe = self._is_keyframe(frame)  # Sec. 3.4
             if self._is_due(frame):
@@ -189,10 +197,24 @@ class Slam:
         """
         self.history.break_off()
 
+    def _direct_tracker(self) -> DirectTracker | None:
+        if self.config.tracking.optimizer != "direct" or self.config.tracking.use_given_poses:
+            return None
+        max_depth, readout = self.config.grid.max_depth, self._timing.readout
+        return DirectTracker(
+            self.intrinsics, self.config.direct, max_depth, self.device, self.keyframes, self.images, readout
+        )
+
     # -- its steps -----------------------------------------------------------------------------------------------
 
     def _admit(
-        self, rgb: Any, depth: Any, timestamp: float | None, pose: np.ndarray | None, depth_scale: float | None
+        self,
+        rgb: Any,
+        depth: Any,
+        timestamp: float | None,
+        pose: np.ndarray | None,
+        depth_scale: float | None,
+        depth_timestamp: float | None,
     ) -> AdmittedFrame:
         config = self.config
         return admit(
@@ -205,6 +227,8 @@ class Slam:
             last_timestamp=self.history.last_timestamp,
             intrinsics=self.intrinsics,
             config=config,
+            depth_timestamp=depth_timestamp if config.sensor_timing else None,
+            timing=self._timing,
             colored=config.tracking.color_weight > 0 or config.mapping.color_weight > 0,
         )
 
@@ -219,7 +243,7 @@ class Slam:
 
     def _make_current(self, frame: AdmittedFrame) -> None:
         """Its images into slot 0 of the pool."""
-        if self.scene.is_empty and not self.config.mapping.enabled:
+        if self.scene.is_empty and not self.config.mapping.enabled and self.direct is None:
             raise InputError("the map is empty and mapping.enabled is off: load a map with Slam.load")
         self.images.set(0, frame.rgb, frame.depth)
         self._current = frame.index
@@ -227,17 +251,52 @@ class Slam:
     def _locate(self, frame: AdmittedFrame, account: _Account) -> Located:
         """Where the camera is: tracked against the map; given, or the origin, where there is nothing to track by."""
         given = frame.given_pose
-        is_starting = self.history.last_known is None and given is not None
-        if self.scene.is_empty or self.config.tracking.use_given_poses or is_starting:
-            return Located(np.eye(4) if given is None else given)
+        is_starting = self.history.last_known is None and (given is not None or not self._has_begun)
+        if self.config.tracking.use_given_poses or is_starting:
+            pose = np.eye(4) if given is None else given
+            if self.direct is not None:
+                with account.timed("tracking"):
+                    self.direct.place(frame, pose)
+            return Located(pose)
         with account.timed("tracking"):
+            if self.direct is not None:
+                return self.direct.locate(frame, self.history)
+            self.images.rectify_current(self._motion(frame))
             located = self.localizer.locate(self.scene.arrays(), self.images, frame.index, self.history, self.keyframes)
         if located.loss is not None:
             account.losses["tracking"] = located.loss
         return located
 
+    @property
+    def _has_begun(self) -> bool:
+        """Whether there is something to track by."""
+        return not self.scene.is_empty if self.direct is None else bool(self.keyframes)
+
+    def _motion(self, frame: AdmittedFrame) -> FrameMotion:
+        """How the camera moved while it took a frame, as far as is known by now."""
+        return FrameMotion(depth_offset=frame.depth_offset, readout=self._timing.readout).with_twist(
+            self.history.twist()
+        )
+
+    def _note_motion(self, frame: AdmittedFrame) -> None:
+        """Rectify the current image by how the camera came to its pose; and tell a keyframe just before of what came
+        after it: between two frames it moved as over both steps, and the first had no step at all.
+        """
+        if self.direct is not None:
+            self.images.rectify_current(self.direct.motion)
+            return
+        motion = self._motion(frame)
+        self.images.rectify_current(motion)
+        last = self.keyframes[-1] if self.keyframes else None
+        if last is None or self.history.last_known != frame.index:
+            return
+        if frame.index - last.index <= (1 if self.history.follows(last.index) else TWIST_STEPS):
+            last.motion = last.motion.with_twist(np.array(motion.twist))
+
     def _is_keyframe(self, frame: AdmittedFrame) -> bool:
         config = self.config.keyframes
+        if self.direct is not None:
+            return False  # it makes them itself
         if not self.keyframes:
             return True
         if config.policy == "interval":
@@ -248,10 +307,11 @@ class Slam:
         """Have a frame mapped."""
         is_first, pose = self.scene.is_empty, self.history.pose(frame.index)
         with account.timed("mapping"):
-            extent = measured_extent(frame.depth, pose, self.intrinsics)
+            depth = frame.depth if self.images.motion.is_none else self.images.current_depth()
+            extent = measured_extent(depth, pose, self.intrinsics)
             task = MappingTask("first" if is_first else "frame", frame.index, pose, extent)
-            self.scheduler.start(task, self.keyframes)
-            self._seen.append(SeenDepth.of(frame.index, frame.depth))
+            self.scheduler.start(task, [keyframe for keyframe in self.keyframes if keyframe.index != frame.index])
+            self._seen.append(SeenDepth.of(frame.index, depth))
             account.losses.update(self._take_over(wait=is_first))
 
     def _take_over(self, *, wait: bool = False) -> dict[str, float]:
@@ -269,7 +329,7 @@ class Slam:
     def _insert_keyframe(self, frame: AdmittedFrame, account: _Account) -> None:
         with account.timed("keyframe"):
             image = self.images.keep_current()
-            self.keyframes.append(Keyframe(frame.index, image, self.history.pose(frame.index)))
+            self.keyframes.append(Keyframe(frame.index, image, self.history.pose(frame.index), self.images.motion))
 
     def _refine(self, index: int, first_round: int, rounds: int) -> None:
         which = range(first_round, first_round + rounds)
@@ -291,6 +351,11 @@ class Slam:
         )
 
     # -- what came out -------------------------------------------------------------------------------------------
+
+    @property
+    def _timing(self) -> SensorTiming:
+        """As it is corrected for."""
+        return self.timing if self.config.sensor_timing else ONE_MOMENT
 
     @property
     def trajectory(self) -> Trajectory:
@@ -370,6 +435,7 @@ class Slam:
         *,
         config: Config | None = None,
         localize_only: bool = False,
+        timing: SensorTiming | None = None,
     ) -> Slam:
         """Read what `save` wrote; the result goes on from the last frame.
 
@@ -379,12 +445,14 @@ class Slam:
             config: Settings from now on, those saved by default; the grids' spacings are the map's.
             localize_only: The map stays as it is, and the camera may be anywhere in it: `mapping.enabled` is off, and
                 `forget_pose` was called.
+            timing: Of the frames to come, if it is not that of the frames before.
 
         Raises:
             CheckpointError: The file is missing, damaged, or of another version.
             ConfigError: ``config`` does not fit the map.
         """
         slam = cls.from_state(read_slam(Path(path), config), device, localize_only=localize_only)
+        slam.timing = slam.timing if timing is None else timing
         if localize_only:
             slam.forget_pose()
         return slam
@@ -395,15 +463,18 @@ class Slam:
         return SlamState(
             config=self.config,
             intrinsics=self.intrinsics,
+            timing=self.timing,
             seed=self.seed,
             device=self.device,
             history=self.history.state(),
             scene=self.scene.state(),
             current_image=self.images.current(),
+            current_motion=self.images.motion,
             keyframes=[(keyframe, self.images.kept(keyframe.image)) for keyframe in self.keyframes],
             seen=self._seen,
             current=self._current,
             mapped=self._mapped,
+            direct=None if self.direct is None else self.direct.state(),
         )
 
     @classmethod
@@ -417,13 +488,20 @@ class Slam:
         """
         config = state.config.model_copy(deep=True)
         config.mapping.enabled &= not localize_only
-        slam = cls(state.intrinsics, config, device, state.seed, decoders=state.scene.decoders)
+        slam = cls(state.intrinsics, config, device, state.seed, decoders=state.scene.decoders, timing=state.timing)
         slam.history = FrameHistory.restored(state.history)
         slam.scene.restore(state.scene)
-        slam.images.restore(state.current_image, [image for _, image in state.keyframes])
-        slam.keyframes = [Keyframe(one.index, n, one.pose.copy()) for n, (one, _) in enumerate(state.keyframes)]
+        images = [image for _, image in state.keyframes]
+        slam.images.restore(state.current_image, state.current_motion, images)
+        slam.keyframes = [
+            Keyframe(one.index, n, one.pose.copy(), one.motion) for n, (one, _) in enumerate(state.keyframes)
+        ]
         slam._seen = list(state.seen)
         slam._current, slam._mapped = state.current, state.mapped
+        if slam.direct is not None:
+            slam.direct = direct = slam._direct_tracker()
+            if direct is not None and state.direct is not None:
+                direct.restore(state.direct, state.current, state.current_motion)
         return slam
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import FrameMotion, Intrinsics, SensorTiming
 from warpslam.config import Config
 from warpslam.errors import ConfigError, InputError
 from warpslam.field.decoders import LEVELS, Decoders, DecoderWeights, expected_shapes
@@ -23,9 +23,10 @@ from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
 from warpslam.scene.scene_map import SceneState
 from warpslam.storage.state_file import StateFields, StateFormat, read_state, write_state
+from warpslam.tracking.direct.tracker import DirectState
 from warpslam.trajectory import HistoryState
 
-MAP_FORMAT = StateFormat("warpslam-map", 5, "the map of a run with --method nice-slam")
+MAP_FORMAT = StateFormat("warpslam-map", 6, "the map of a run with --method nice-slam")
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,8 @@ class SlamState:
     """Settings."""
     intrinsics: Intrinsics
     """Camera."""
+    timing: SensorTiming
+    """When its pixels are taken."""
     seed: int
     """Of every random choice."""
     device: wp.Device
@@ -45,7 +48,9 @@ class SlamState:
     scene: SceneState
     """The map."""
     current_image: tuple[np.ndarray, np.ndarray, float]
-    """Colour, uint16 depth and its scale of the current frame."""
+    """Colour, uint16 depth and its scale of the current frame, as it was taken."""
+    current_motion: FrameMotion
+    """What it is rectified by."""
     keyframes: Sequence[tuple[Keyframe, CompactImage]]
     """In their order."""
     seen: Sequence[SeenDepth]
@@ -54,6 +59,8 @@ class SlamState:
     """The current frame, if there is one."""
     mapped: int | None
     """The last frame that was mapped, if there is one."""
+    direct: DirectState | None = None
+    """What direct tracking goes on from."""
 
 
 def write_slam(path: Path, state: SlamState) -> None:
@@ -97,25 +104,31 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
         "slices": slice_count(state.device),
         "config": state.config.model_dump(),
         "intrinsics": vars(state.intrinsics),
+        "timing": vars(state.timing),
         "current": state.current,
         "mapped": state.mapped,
         "first": state.history.first,
         "keyframes": [keyframe.index for keyframe, _ in state.keyframes],
         "seen": [seen.index for seen in state.seen],
+        "direct": None if state.direct is None else _direct_header(state.direct),
     }
     rgb, depth, scale = state.current_image
     images = [image for _, image in state.keyframes]
     keyframe_poses = [keyframe.pose for keyframe, _ in state.keyframes]
+    motions = [state.current_motion, *(keyframe.motion for keyframe, _ in state.keyframes)]
     seen = [one.millimetres for one in state.seen]
     arrays: dict[str, np.ndarray] = {
         **state.history.arrays(),
         "bounds": np.stack([state.scene.low, state.scene.high]),
+        "motions": np.array([one.to_array() for one in motions], np.float64),
         "keyframe_poses": np.array(keyframe_poses, np.float64).reshape(-1, 4, 4),
         "seen": np.array(seen, np.uint16).reshape(-1, *_seen_size(state.intrinsics)),
         "current_rgb": rgb,
         "current_depth": depth,
         "image_scales": np.array([scale, *(image.scale for image in images)], np.float64),
     }
+    if state.direct is not None:
+        arrays |= {f"direct_{name}": array for name, array in state.direct.arrays().items()}
     for n, image in enumerate(images):
         arrays[f"image_{n}_rgb"] = np.frombuffer(image.rgb, np.uint8)
         arrays[f"image_{n}_depth"] = np.frombuffer(image.depth, np.uint8)
@@ -155,6 +168,7 @@ def state_from_arrays(
         check_settings(camera, config)
     except (TypeError, ConfigError, InputError) as error:
         raise fields.damaged("intrinsics", error) from None
+    timing = fields.parsed("timing", lambda values: SensorTiming(**values))
     history = HistoryState.read(fields)
     count = len(history.poses)
     size = (camera.height, camera.width)
@@ -162,7 +176,8 @@ def state_from_arrays(
     scales = fields.array("image_scales", np.float64, (len(frames) + 1,)).tolist()
     images = [_image(fields, n, scales[n + 1], camera) for n in range(len(frames))]
     poses = fields.array("keyframe_poses", np.float64, (len(frames), 4, 4)).copy()
-    keyframes = [Keyframe(index, n, pose) for n, (index, pose) in enumerate(zip(frames, poses, strict=True))]
+    motions = [FrameMotion.from_array(one) for one in fields.array("motions", np.float64, (len(frames) + 1, 8))]
+    keyframes = [Keyframe(index, n, poses[n], motions[n + 1]) for n, index in enumerate(frames)]
     seen = fields.frames("seen", count)
     depths = fields.array("seen", np.uint16, (len(seen), *_seen_size(camera)))
     rgb, depth = fields.array("current_rgb", np.uint8, (*size, 3)), fields.array("current_depth", np.uint16, size)
@@ -171,15 +186,18 @@ def state_from_arrays(
     return SlamState(
         config=config,
         intrinsics=camera,
+        timing=timing,
         seed=fields.integer("seed"),
         device=wp.get_device("cpu"),
         history=history,
         scene=SceneState(decoders, low, high, {level: _grid(fields, level) for level in LEVELS}),
         current_image=(rgb, depth, scales[0]),
+        current_motion=motions[0],
         keyframes=list(zip(keyframes, images, strict=True)),
         seen=[SeenDepth(index, image) for index, image in zip(seen, depths, strict=True)],
         current=fields.frame("current", count),
         mapped=fields.frame("mapped", count),
+        direct=_direct(fields, count, len(frames)),
     )
 
 
@@ -209,6 +227,37 @@ def _image(fields: StateFields, n: int, scale: float, camera: Intrinsics) -> Com
     except (ValueError, zlib.error) as error:
         raise fields.damaged(f"image_{n}", error) from None
     return image
+
+
+def _direct_header(state: DirectState) -> dict[str, Any]:
+    # JSON knows no infinity.
+    scale, cost = (value if np.isfinite(value) else None for value in state.typical)
+    return {"reference": state.reference, "before": state.before, "scale": scale, "cost": cost}
+
+
+def _direct(fields: StateFields, frames: int, keyframes: int) -> DirectState | None:
+    header = fields.header.get("direct")
+    if header is None:
+        return None
+    anchors = fields.array("direct_anchors", np.int64, (None,))
+    count = len(anchors)
+    if count > frames or (anchors >= keyframes).any():
+        raise fields.damaged("direct_anchors", f"{count} frames of {frames}, keyframes up to {anchors.max(initial=-1)}")
+    try:
+        reference, before = int(header["reference"]), int(header["before"])
+        scale, cost = (np.inf if header[name] is None else float(header[name]) for name in ("scale", "cost"))
+    except (KeyError, TypeError, ValueError) as error:
+        raise fields.damaged("direct", error) from None
+    if not (0 <= reference < max(keyframes, 1) and -1 <= before < frames):
+        raise fields.damaged("direct", f"reference {reference} of {keyframes}, frame {before} of {frames}")
+    return DirectState(
+        anchors=anchors.copy(),
+        relative=fields.array("direct_relative", np.float64, (count, 4, 4)).copy(),
+        overlap=fields.array("direct_overlap", np.float64, (keyframes,)).copy(),
+        reference=reference,
+        before=before,
+        typical=(scale, cost),
+    )
 
 
 def _seen_size(camera: Intrinsics) -> tuple[int, int]:

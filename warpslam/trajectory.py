@@ -12,10 +12,12 @@ from itertools import islice
 import numpy as np
 
 from warpslam.frames import FrameStatus
-from warpslam.poses import motion_between
+from warpslam.poses import inverse, motion_between, twist_of
 from warpslam.storage.state_file import StateFields
 
 RECENT_FRAMES = 20
+TWIST_STEPS = 2
+"""Over one frame step an error of a pose would feed back into the next frame by tau over the frame time."""
 STEP_FACTOR = 5.0  # a step beyond this multiple of the recent ones is a jump
 
 
@@ -198,9 +200,33 @@ class FrameHistory:
         if last is None:
             return []
         T = self._poses[last]
-        if constant_speed and last == len(self) - 1 and self._follows(last):
+        if constant_speed and last == len(self) - 1 and self.follows(last):
             return [T @ self._motion, T]
         return [T]
+
+    def twist(self, steps: int = TWIST_STEPS) -> np.ndarray:
+        """Mean twist (v, w) of the camera [m/s, rad/s] over the last ``steps`` frames, in its axes, (6,); 0 where it is
+        not known.
+        """
+        last, first = len(self) - 1, self.earlier(steps)
+        if first is None:
+            return np.zeros(6)
+        seconds = self._timestamps[last] - self._timestamps[first]
+        if first == last or seconds <= 0.0:
+            return np.zeros(6)
+        return twist_of(inverse(self._poses[first]) @ self._poses[last]) / seconds
+
+    def earlier(self, steps: int) -> int | None:
+        """The frame ``steps`` before the last, or as many as the camera has moved without a break since; None if the
+        pose of the last frame is not known.
+        """
+        last = self.last_known
+        if last is None or last != len(self) - 1:
+            return None
+        first = last
+        while first > last - steps and self.follows(first):
+            first -= 1
+        return first
 
     def is_jump(self, T_world_camera: np.ndarray, max_step: float, max_turn: float) -> bool:
         """Whether the camera can't well have come to a pose: a step beyond ``max_step`` [m] or ``max_turn`` [degrees] a
@@ -209,7 +235,7 @@ class FrameHistory:
         last = self.last_known
         if last is None:
             return False
-        recent = [n for n in self._recent() if self._follows(n)]
+        recent = [n for n in self._recent() if self.follows(n)]
         # Before any step is known the camera may be a fast one.
         usual = np.array([max_step, max_turn])
         if recent:
@@ -230,7 +256,7 @@ class FrameHistory:
     def _recent(self) -> list[int]:
         return list(islice(self._known(), RECENT_FRAMES))
 
-    def _follows(self, index: int) -> bool:
+    def follows(self, index: int) -> bool:
         """Whether the frame before one is known, too, without a break between."""
         return index > self._first and self._status[index - 1] is FrameStatus.OK
 

@@ -29,7 +29,7 @@ def faked(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
     class Slam(FakeSlam):
         configs: list = []
 
-    def build(intrinsics, config, device, seed, method):
+    def build(intrinsics, config, device, seed, method, timing):
         Slam.configs.append(config)
         return Slam(intrinsics, config=config, device=device, seed=seed)
 
@@ -126,7 +126,7 @@ def test_method_and_poses_are_passed_on(faked, tmp_path, capsys, monkeypatch):
     assert read_json(tmp_path / "b" / "metrics.json")["poses"] == poses
     methods = []
 
-    def build(intrinsics, config, device, seed, method):
+    def build(intrinsics, config, device, seed, method, timing):
         methods.append(method)
         return faked(intrinsics, config=config)
 

@@ -45,7 +45,7 @@ def test_paper_presets_hold_what_our_defaults_change(name):
     """The released code: keyframes every 50 frames, even samples, uniform pixels, Adam at a constant rate."""
     config = Config.from_preset(name)
     assert config.keyframes.every == 50 and not config.sampling.jitter
-    assert config.tracking.final_rate_factor == 1.0
+    assert config.tracking.final_rate_factor == 1.0 and not config.sensor_timing
     if name != "paper_imap":  # has settings of its own for the rest
         assert config.tracking.optimizer == "adam"
         assert config.mapping.active_share == 0.0 and config.mapping.first_iterations == 1500

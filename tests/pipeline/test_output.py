@@ -34,14 +34,14 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
     class Slam(FakeSlam):
         skip: tuple[int, ...] = ()
 
-        def step(self, rgb, depth, timestamp=None, T_world_camera=None):
+        def step(self, rgb, depth, timestamp=None, T_world_camera=None, *, depth_timestamp=None):
             result = super().step(rgb, depth, timestamp, T_world_camera)
             if result.index in self.skip or (T_world_camera is not None and np.isnan(T_world_camera).any()):
                 result.status, result.message = "SKIPPED", "no use"
             return result
 
     monkeypatch.setattr(
-        pipeline, "build_slam", lambda intrinsics, config, device, seed, method: Slam(intrinsics, config=config)
+        pipeline, "build_slam", lambda intrinsics, config, device, seed, method, timing: Slam(intrinsics, config=config)
     )
     monkeypatch.setattr(pipeline, "draw_plots", lambda *arguments: None)
     monkeypatch.setattr(pipeline, "draw_panels", lambda *arguments: None)

@@ -34,7 +34,7 @@ def fake_slam(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
         made: list[FakeSlam] = []
         loaded: list[FakeSlam] = []
 
-    def build(intrinsics, config, device, seed, method):
+    def build(intrinsics, config, device, seed, method, timing):
         Slam.made.append(Slam(intrinsics, config=config, device=device, seed=seed))
         return Slam.made[-1]
 

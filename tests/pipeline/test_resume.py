@@ -46,10 +46,12 @@ def no_plots():
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Path:
-    """A few frames on disk, one of which can't be read."""
+    """A few frames on disk, one of which can't be read, of a camera with a delay and a rolling shutter."""
     folder = tmp_path_factory.mktemp("recording")
     write_replica(SyntheticSequence(0, FRAMES, intrinsics=CAMERA), folder)
     (folder / "results" / "frame000003.png").write_bytes(b"no image")
+    with (folder / "camera.yaml").open("a") as file:
+        file.write("depth_delay: -0.02\nreadout: 0.03\n")
     return folder
 
 

@@ -33,7 +33,7 @@ def make_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., R
 
     def make(name: str = "run", sequence: FakeSequence | None = None, **behaviour: Any) -> RunFolder:
         slam = type("Slam", (FakeSlam,), behaviour)
-        monkeypatch.setattr(pipeline, "build_slam", lambda camera, config, device, seed, method: slam(camera))
+        monkeypatch.setattr(pipeline, "build_slam", lambda camera, config, device, seed, method, timing: slam(camera))
         source = Source("somewhere", command="warpslam run somewhere --seed 0")
         sequence = sequence or FakeSequence(8)
         try:

@@ -136,7 +136,9 @@ def test_run_shows_and_records_what_it_compiles(empty_cache, monkeypatch, tmp_pa
     from tests.fakes import FakeSlam
     from warpslam.storage.json_files import read_json
 
-    monkeypatch.setattr(pipeline, "build_slam", lambda intrinsics, config, device, seed, method: FakeSlam(intrinsics))
+    monkeypatch.setattr(
+        pipeline, "build_slam", lambda intrinsics, config, device, seed, method, timing: FakeSlam(intrinsics)
+    )
     monkeypatch.setattr(pipeline, "draw_plots", lambda *arguments: None)
     monkeypatch.setattr(pipeline, "draw_panels", lambda *arguments: None)
     monkeypatch.setattr(pipeline, "open_source", lambda source: FakeSequence(3))

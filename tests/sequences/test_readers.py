@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import builtins
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.sequences import writers
-from warpslam.camera import Intrinsics
-from warpslam.errors import MissingDependencyError
+from warpslam.camera import ONE_MOMENT, Intrinsics, SensorTiming
+from warpslam.errors import DatasetError, MissingDependencyError
 from warpslam.sequences import open_sequence
+from warpslam.sequences.calibration import Calibration
 
+TUM_CAMERA = f"20,21,11.5,7.5,{writers.WIDTH},{writers.HEIGHT},1000"
 TINY = Intrinsics(20, 21, 11.5, 7.5, writers.WIDTH, writers.HEIGHT)
 
 
@@ -279,3 +282,42 @@ def test_undistortion_straightens_colour_only(tmp_path):
     assert np.abs(distorted_u - u)[inside].max() > 2
     assert np.abs(frame.rgb[..., 0] - 3 * distorted_u)[inside].max() <= 1
     assert np.abs(frame.rgb[..., 1] - 4 * distorted_v)[inside].max() <= 1
+
+
+def test_tum_frames_carry_the_stamps_of_their_depth(tmp_path):
+    """Each frame has the time of the depth image that was paired with it; other formats have none."""
+    folder = writers.write_tum(tmp_path / "tum", [1.0, 1.1, 1.2], [0.99, 1.13, 1.18], [1.0, 1.1, 1.2])
+    sequence = open_sequence(folder, camera=TUM_CAMERA)
+    assert [frame.depth_timestamp for frame in sequence] == [0.99, 1.13, 1.18]
+    assert sequence.timing == ONE_MOMENT
+    assert open_sequence(writers.write_replica(tmp_path / "replica"))[0].depth_timestamp is None
+
+
+def test_timing_comes_with_the_camera(tmp_path):
+    """camera.yaml may hold delay and readout, the latter of all stored rows; freiburg1's camera does; text has none."""
+    folder = writers.write_replica(tmp_path)
+    with (folder / "camera.yaml").open("a") as file:
+        file.write("crop: 2\ndepth_delay: -0.01\nreadout: 0.02\n")
+    sequence = open_sequence(folder)
+    share = (writers.HEIGHT - 4) / writers.HEIGHT
+    assert sequence.timing.depth_delay == -0.01 and sequence.timing.readout == pytest.approx(0.02 * share)
+    assert Calibration.of_dataset("tum_fr1").stored_timing == SensorTiming(-0.020, 0.026)
+    assert Calibration.of_dataset("tum_fr2").timing == ONE_MOMENT == Calibration.from_text(TUM_CAMERA).timing
+
+
+@pytest.mark.parametrize("line", ["readout: -1", "depth_delay: 3", "readout: soon"])
+def test_timing_that_no_camera_has(tmp_path, line):
+    """The file and the field are named."""
+    folder = writers.write_replica(tmp_path)
+    with (folder / "camera.yaml").open("a") as file:
+        file.write(f"{line}\n")
+    with pytest.raises(DatasetError, match=rf"camera\.yaml.*{line.split(':')[0]}"):
+        open_sequence(folder)
+
+
+def test_camera_written_as_yaml_is_read_back(tmp_path):
+    """Every field survives, timing included."""
+    fields = {"distortion": [0.1, -0.2, 0, 0, 0.3], "resize": [12, 8], "crop": 1, "depth_delay": -0.02, "readout": 0.03}
+    camera = Calibration.from_fields({**vars(TINY), "depth_scale": 5000, **fields}, "test")
+    (tmp_path / "camera.yaml").write_text(camera.to_yaml())
+    assert replace(Calibration.from_yaml(tmp_path / "camera.yaml"), source="test") == camera

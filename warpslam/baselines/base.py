@@ -49,8 +49,9 @@ class Baseline:
         T_world_camera: np.ndarray | None = None,
         *,
         depth_scale: float | None = None,
+        depth_timestamp: float | None = None,
     ) -> FrameResult:
-        """Take in one frame; arguments and errors are those of `Slam.step`."""
+        """Take in one frame; arguments and errors are those of `Slam.step`. To a baseline all is seen at once."""
         frame = admit(
             len(self.history),
             rgb,
@@ -61,6 +62,7 @@ class Baseline:
             last_timestamp=self.history.last_timestamp,
             intrinsics=self.intrinsics,
             config=self.config,
+            depth_timestamp=depth_timestamp,
         )
         return self._skip(frame) if frame.fault else self._step(frame)
 

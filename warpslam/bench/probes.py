@@ -18,7 +18,7 @@ from warpslam.field.rendering import render_image
 from warpslam.frames import FrameStatus, read_images
 from warpslam.mapping.frustum import measured_extent, select_in_frustum
 from warpslam.mapping.mapper import Mapper
-from warpslam.pipeline.setup import load_kernels, open_source, select_frames
+from warpslam.pipeline.setup import as_configured, load_kernels, open_source, select_frames
 from warpslam.poses import orthonormalized
 from warpslam.runs.given_poses import GivenPoses
 from warpslam.scene.feature_grid import FeatureGrid
@@ -109,7 +109,7 @@ def outside_change(job: Job) -> dict[str, Any]:
     sequence, config, frames = _open(job)
     config = config.updated(["tracking.use_given_poses=true"])
     camera, device = sequence.intrinsics, wp.get_device(job.request.device)
-    slam = Slam(camera, config, job.request.device, job.request.seed)
+    slam = Slam(camera, config, job.request.device, job.request.seed, timing=sequence.timing)
     images = ImagePool(camera, device)
     levels = {level: {"largest": 0.0, "changed": 0, "outside": 0} for level in ("middle", "fine", "color")}
     every = config.mapping.every
@@ -122,7 +122,9 @@ def outside_change(job: Job) -> dict[str, Any]:
 
     for number, (frame, T_world_camera) in enumerate(islice(frames, 1 + MAPPING_CALLS * every)):
         before = {} if number == 0 else {level: snapshot(level) for level in levels}
-        result = slam.step(frame.rgb, frame.depth, frame.timestamp, T_world_camera)
+        result = slam.step(
+            frame.rgb, frame.depth, frame.timestamp, T_world_camera, depth_timestamp=frame.depth_timestamp
+        )
         slam.wait()
         if number % every or number == 0 or result.status != FrameStatus.OK:
             continue
@@ -157,6 +159,7 @@ def _open(job: Job) -> tuple[RgbdSequence, Config, Iterator[tuple[Frame, np.ndar
     sequence = open_source(request.source)
     # Poses are used here, not given to tracking: what the settings say of it stays as it is.
     config = replace(request, poses=None).settings(sequence.preset)
+    sequence = as_configured(sequence, config)
     load_kernels(sequence, request.device)
     given = None if request.poses is None else GivenPoses.read(request.poses)
 

@@ -27,6 +27,10 @@ COMMANDS = {
     "report": ("report", "HTML report of a run, or a comparison of several"),
     "render": ("render", "a frame beside what the map renders at its pose, as PNG"),
     "mesh": ("mesh", "extract the mesh of a run again"),
+    "calibrate-time": (
+        "calibrate_time",
+        "delay of depth and readout time of a camera, from a recording in which it moves",
+    ),
     "profile": ("profile", "time of every kernel of a run; writes no run folder"),
     "render-room": ("render_room", "rendered rooms: RGB-D sequences with their truth, and pictures"),
     "warmup": ("warmup", "compile all kernels ahead of the first run"),

@@ -2,6 +2,7 @@
 
 from warpslam.config.presets import PRESETS as PRESETS
 from warpslam.config.settings import Config as Config
+from warpslam.config.settings import DirectConfig as DirectConfig
 from warpslam.config.settings import GridConfig as GridConfig
 from warpslam.config.settings import ImapConfig as ImapConfig
 from warpslam.config.settings import KeyframeConfig as KeyframeConfig

@@ -21,6 +21,8 @@ def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, A
         "mapping": mapping,
         "keyframes": {"every": 50},
         "meshing": {"level_set": 0.0},
+        "sensor_timing": False,
+        "published_images": True,
         **groups,
     }
 
@@ -50,6 +52,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         grid=_TUM_GRID,
     ),
     "paper_imap": {
+        "sensor_timing": False,
+        "published_images": True,
         "sampling": {"jitter": False},
         "keyframes": {"every": 50},
         "tracking": {"final_rate_factor": 1.0},

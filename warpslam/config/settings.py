@@ -66,8 +66,10 @@ class SamplingConfig(_Group):
 class TrackingConfig(_Group):
     """Camera tracking (Sec. 3.3, Eq. 11-12)."""
 
-    optimizer: Literal["adam", "gauss_newton"] = Field(
-        "gauss_newton", description="Adam on the pose vector (paper), or Gauss-Newton on the same loss, reweighted"
+    optimizer: Literal["direct", "adam", "gauss_newton"] = Field(
+        "direct",
+        description="direct registration against keyframes; or against renders of the map: Adam on the pose vector "
+        "(paper), or Gauss-Newton on the same loss, reweighted",
     )
     pixels: int = Field(300, ge=16, le=100_000, description="rays per iteration")
     iterations: int = Field(6, ge=1, le=10_000, description="iterations per frame")
@@ -181,6 +183,39 @@ class MappingConfig(_Group):
     refinement_rounds: int = Field(5, ge=1, description="rounds of `iterations` in the final refinement")
 
 
+class DirectConfig(_Group):
+    """Direct registration against keyframes (``tracking.optimizer: direct``)."""
+
+    grey_weight: float = Field(2.0, ge=0, description="weight of the photometric residual")
+    depth_weight: float = Field(1.0, ge=0, description="weight of the geometric residual")
+    grey_floor: float = Field(2.0, gt=0, description="photometric residuals spread by no less [grey values of 255]")
+    depth_floor: float = Field(0.3, gt=0, description="geometric residuals spread by no less [sigma of depth]")
+    joint: int = Field(3, ge=0, le=4, description="keyframes that a pose is registered to at once; 0 = the nearest")
+    joint_iterations: int = Field(3, ge=1, le=20, description="iterations of that")
+    window: int = Field(7, ge=0, le=20, description="keyframes refined when one is added; 0 = none")
+    window_iterations: int = Field(2, ge=1, le=20, description="iterations of that")
+    keyframe_overlap: float = Field(
+        0.75, gt=0, lt=1, description="a frame becomes a keyframe where it shares less with the reference"
+    )
+    keyframe_step: float = Field(0.12, gt=0, description="or where it is further away, as a share of the mean depth")
+    keyframe_turn: float = Field(12.0, gt=0, description="or where it has turned by more [degrees]")
+    sure_agreement: float = Field(0.85, ge=0, le=1, description="share of depth that agrees, for a pose beyond doubt")
+    sure_correlation: float = Field(0.88, ge=-1, le=1, description="correlation of grey values, for the same")
+    sure_cost: float = Field(2.0, gt=1, description="robust cost over its running mean, for the same")
+    sure_shift: float = Field(
+        10.0, gt=0, description="shift of the image against what constant speed foretold, for the same [px of 80 x 60]"
+    )
+    lost_agreement: float = Field(0.5, ge=0, le=1, description="share of depth that agrees, for a pose to be believed")
+    lost_correlation: float = Field(0.85, ge=-1, le=1, description="correlation of grey values, for the same")
+    lost_view: float = Field(0.15, ge=0, le=1, description="share of the keyframe in view, for the same")
+    lost_known: float = Field(0.08, ge=0, le=1, description="share of it where both have depth, for the same")
+    search_span: float = Field(24.0, gt=0, le=60, description="rotations searched, up to this [degrees]")
+    search_kept: int = Field(3, ge=1, le=20, description="rotations tried further")
+    search_weak: bool = Field(True, description="search along the two motions that depth determines least, too")
+    search_steps: int = Field(16, ge=1, le=64, description="steps of a pixel along these, both ways")
+    relocalization_keyframes: int = Field(60, ge=1, description="latest keyframes that a lost camera is looked for at")
+
+
 class KeyframeConfig(_Group):
     """Keyframe selection (Sec. 3.4)."""
 
@@ -255,6 +290,7 @@ class Config(_Group):
     grid: GridConfig = Field(default_factory=GridConfig)
     sampling: SamplingConfig = Field(default_factory=SamplingConfig)
     tracking: TrackingConfig = Field(default_factory=TrackingConfig)
+    direct: DirectConfig = Field(default_factory=DirectConfig)
     mapping: MappingConfig = Field(default_factory=MappingConfig)
     keyframes: KeyframeConfig = Field(default_factory=KeyframeConfig)
     meshing: MeshingConfig = Field(default_factory=MeshingConfig)
@@ -264,6 +300,14 @@ class Config(_Group):
         "strict",
         description="strict: mapping after tracking, runs repeat to the bit; overlapped: beside it, and the map is at "
         "most one mapping interval behind",
+    )
+    published_images: bool = Field(
+        False, description="frames are resized and cropped as in the paper's code, where a dataset's camera says how"
+    )
+    sensor_timing: bool = Field(
+        True,
+        description="depth that is taken before or after colour, and rows that are taken one after the other, are "
+        "corrected for where stamps or the camera tell; off = every pixel is taken at once (paper)",
     )
     decoders: str | None = Field(None, description="decoder checkpoint; the package's own when empty")
 
@@ -315,22 +359,22 @@ class Config(_Group):
         for override in overrides:
             merge(changes, parse_override(override))
         values = self.model_dump()
-        if self.tracking.use_given_poses:
-            derived = {name: MappingConfig.model_fields[name].default for name in _FOLLOW_GIVEN_POSES}
-            tracked = Config.from_dict(_merged(values, changes)).tracking
-            if not tracked.use_given_poses:
-                merge(values, {"mapping": derived})
+        tracked = Config.from_dict(_merged(values, changes)).tracking
+        if self.tracking.use_given_poses and not tracked.use_given_poses:
+            merge(values, {"mapping": {name: MappingConfig.model_fields[name].default for name in _FOLLOW_GIVEN_POSES}})
+        elif self.tracking.optimizer == "direct" != tracked.optimizer:
+            merge(values, {"mapping": {"bundle_adjustment": MappingConfig.model_fields["bundle_adjustment"].default}})
         return self.from_dict(_merged(values, changes))
 
     def resolved(self) -> Config:
         """These settings with all that follows from others written out: what a `Slam` runs with.
 
         Poses that are given stay as they are and can be believed, so there is no bundle adjustment, and new features
-        start from the measured depth unless that is off.
+        start from the measured depth unless that is off. With direct registration the tracker refines keyframes itself.
         """
         given, mapping = self.tracking.use_given_poses, self.mapping
         derived = {
-            "bundle_adjustment": mapping.bundle_adjustment and not given,
+            "bundle_adjustment": mapping.bundle_adjustment and not given and self.tracking.optimizer != "direct",
             "depth_start": given if mapping.depth_start is None else mapping.depth_start,
         }
         return self.model_copy(update={"mapping": mapping.model_copy(update=derived)})

@@ -25,9 +25,10 @@ SETTINGS = (  # for a minute of two cores; leave them out for the best that ther
 def main(frame_count: int = 20, *, settings: Sequence[str] = SETTINGS, output: Path = Path("first_steps.ply")) -> float:
     """Track, map and write the mesh; returns the error of the trajectory [m]."""
     sequence = SyntheticSequence(room_seed=0, frame_count=frame_count, intrinsics=CAMERA)
-    slam = warpslam.Slam(sequence.intrinsics, warpslam.Config.from_preset(sequence.preset, list(settings)))
+    config = warpslam.Config.from_preset(sequence.preset, list(settings))
+    slam = warpslam.Slam(sequence.intrinsics, config, timing=sequence.timing)
     for frame in sequence:
-        result = slam.step(frame.rgb, frame.depth, frame.timestamp)
+        result = slam.step(frame.rgb, frame.depth, frame.timestamp, depth_timestamp=frame.depth_timestamp)
         print(f"frame {result.index}: {result.status}, camera at {result.T_world_camera[:3, 3].round(3)} m")
     slam.finish()
     error = warpslam.ate(slam.trajectory.poses, sequence.ground_truth()).rmse

@@ -183,7 +183,8 @@ class Mapper:
         coarse = self._choose_windows(call, images, keyframes)
         self._poses.begin(_vectors(call.window, pose), np.full((1, 2), config.bundle_adjustment_rate))
         # Both windows at once: they must be on the device together.
-        in_use = images.bring([keyframe.image for keyframe in (*call.window, *coarse)])
+        together = (*call.window, *coarse)
+        in_use = images.bring([one.image for one in together], [one.motion for one in together])
         slots = wp.array([*in_use[: len(call.window)], 0], dtype=int, device=self.device)
         self._select(images, pose, everything=refinement)
         self._launcher.forget()

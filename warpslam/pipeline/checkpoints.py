@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from warpslam.pipeline.methods import Method
     from warpslam.sequences.base import Frame, RgbdSequence
 
-RUN_FORMAT = StateFormat("warpslam-run", 4)
+RUN_FORMAT = StateFormat("warpslam-run", 5)
 log = logging.getLogger(__name__)
 
 
@@ -219,8 +219,8 @@ def find_checkpoint(folder: RunFolder, request: RunRequest, sequence: RgbdSequen
 
 
 def frame_digest(frame: Frame) -> str:
-    """SHA-256 of a frame's images and time."""
-    digest = hashlib.sha256(repr(float(frame.timestamp)).encode())
+    """SHA-256 of a frame's images and times."""
+    digest = hashlib.sha256(repr((frame.timestamp, frame.depth_timestamp)).encode())
     for image in (frame.rgb, frame.depth):
         digest.update(np.ascontiguousarray(image).data)
     return digest.hexdigest()

@@ -67,7 +67,11 @@ class FrameLoop:
         for frame in self._readable_frames():
             truth = _true_pose(frame)
             result = self.slam.step(
-                frame.rgb, frame.depth, timestamp=frame.timestamp, T_world_camera=self._given_pose(frame, truth)
+                frame.rgb,
+                frame.depth,
+                timestamp=frame.timestamp,
+                T_world_camera=self._given_pose(frame, truth),
+                depth_timestamp=frame.depth_timestamp,
             )
             self.record.add(frame.index, truth, result)
             level = logging.INFO if result.status == FrameStatus.OK else logging.WARNING

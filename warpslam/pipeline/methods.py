@@ -13,7 +13,7 @@ from warpslam.runs.request import DEFAULT_METHOD as DEFAULT_METHOD
 if TYPE_CHECKING:
     import trimesh
 
-    from warpslam.camera import Intrinsics
+    from warpslam.camera import Intrinsics, SensorTiming
     from warpslam.config import Config
     from warpslam.field.rendering import RenderedImage
     from warpslam.frames import FrameResult
@@ -37,7 +37,13 @@ class Method(Protocol):
     """Seconds spent on compiling kernels."""
 
     def step(
-        self, rgb: Any, depth: Any, timestamp: float | None = None, T_world_camera: np.ndarray | None = None
+        self,
+        rgb: Any,
+        depth: Any,
+        timestamp: float | None = None,
+        T_world_camera: np.ndarray | None = None,
+        *,
+        depth_timestamp: float | None = None,
     ) -> FrameResult:
         """Take in one frame, with its pose where that is known."""
         ...
@@ -90,7 +96,9 @@ class Method(Protocol):
         ...
 
 
-def build_method(name: str, intrinsics: Intrinsics, config: Config, device: str | None, seed: int) -> Method:
+def build_method(
+    name: str, intrinsics: Intrinsics, config: Config, device: str | None, seed: int, timing: SensorTiming
+) -> Method:
     """A new method.
 
     Raises:
@@ -98,7 +106,9 @@ def build_method(name: str, intrinsics: Intrinsics, config: Config, device: str 
         CheckpointError: The decoders can't be loaded.
         MissingDependencyError: The method needs an optional package that can't be loaded.
     """
-    return _class_of(name)(intrinsics, config=config, device=device, seed=seed)
+    # Baselines take all pixels of a frame as seen at once.
+    more = {"timing": timing} if name == DEFAULT_METHOD else {}
+    return _class_of(name)(intrinsics, config=config, device=device, seed=seed, **more)
 
 
 def load_method(name: str, path: Path, device: str | None) -> Method:

@@ -29,7 +29,15 @@ from warpslam.pipeline.results import (
     write_map,
     write_trajectory,
 )
-from warpslam.pipeline.setup import build_slam, load_kernels, open_map, open_source, resolve, true_surface
+from warpslam.pipeline.setup import (
+    as_configured,
+    build_slam,
+    load_kernels,
+    open_map,
+    open_source,
+    resolve,
+    true_surface,
+)
 from warpslam.report import write_report
 from warpslam.runs.folder import RunFolder
 from warpslam.runs.given_poses import GivenPoses
@@ -88,6 +96,7 @@ def run(
             raise ConfigError("the request has no source: name one, or hand over a sequence")
         sequence = open_source(request.source)
     request = resolve(request, sequence)
+    sequence = as_configured(sequence, request.config)
     truth_mesh = true_surface(request, sequence) if truth_mesh is None else truth_mesh
     observer.begin(sequence.name)
     why_anew = ""
@@ -232,7 +241,7 @@ class Run:
             return None
 
     def _build(self) -> None:
-        request, camera = self.request, self.sequence.intrinsics
+        request, camera, timing = self.request, self.sequence.intrinsics, self.sequence.timing
         with self.record.clock("setup"), kernel_cache_errors():
             with self.record.clock("kernel_compile"):
                 self.modules = load_kernels(self.sequence, request.device, self.observer.module)
@@ -241,11 +250,11 @@ class Run:
                 log.info("resumed from %s, after %d frames", self.saved.path, self.record.position)
             elif request.map is not None:
                 localize = request.localize_only
-                slam = open_map(request.map, camera, self.config, request.device, localize_only=localize)
+                slam = open_map(request.map, camera, self.config, request.device, timing=timing, localize_only=localize)
                 self.record.first_index = len(slam.trajectory.poses)
                 self.slam = slam
             else:
-                self.slam = build_slam(camera, self.config, request.device, request.seed, request.method)
+                self.slam = build_slam(camera, self.config, request.device, request.seed, request.method, timing)
         self.record.seconds["kernel_compile"] += self.slam.compile_seconds
 
     def _process_frames(self) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from warpslam.camera import ONE_MOMENT, Intrinsics, SensorTiming
 from warpslam.errors import ConfigError, InputError
 from warpslam.evaluation import load_mesh
 from warpslam.pipeline.methods import build_method, check_method, has_checkpoints, load_method
@@ -24,7 +25,6 @@ from warpslam.synthetic import demo
 if TYPE_CHECKING:
     import trimesh
 
-    from warpslam.camera import Intrinsics
     from warpslam.config import Config
     from warpslam.pipeline.methods import Method
     from warpslam.sequences.base import RgbdSequence
@@ -39,6 +39,11 @@ def open_source(source: Source) -> RgbdSequence:
     if source.is_demo:
         return demo.demo_sequence()
     return open_sequence(source.path or "", dataset=source.dataset, camera=source.camera)
+
+
+def as_configured(sequence: RgbdSequence, config: Config | None) -> RgbdSequence:
+    """The sequence with frames of the kind that settings ask for."""
+    return sequence.as_published() if config is not None and config.published_images else sequence
 
 
 def true_surface(request: RunRequest, sequence: RgbdSequence) -> trimesh.Trimesh | None:
@@ -129,7 +134,12 @@ def load_kernels(
 
 
 def build_slam(
-    intrinsics: Intrinsics, config: Config, device: str | None, seed: int, method: str = DEFAULT_METHOD
+    intrinsics: Intrinsics,
+    config: Config,
+    device: str | None,
+    seed: int,
+    method: str = DEFAULT_METHOD,
+    timing: SensorTiming = ONE_MOMENT,
 ) -> Method:
     """The method of a run; see `warpslam.pipeline.methods.build_method` for what else it raises.
 
@@ -137,13 +147,19 @@ def build_slam(
         ConfigError: There is no such device.
     """
     check_device(device)
-    return build_method(method, intrinsics, config, device, seed)
+    return build_method(method, intrinsics, config, device, seed, timing)
 
 
 def open_map(
-    path: str | Path, intrinsics: Intrinsics, config: Config, device: str | None, *, localize_only: bool = False
+    path: str | Path,
+    intrinsics: Intrinsics,
+    config: Config,
+    device: str | None,
+    *,
+    timing: SensorTiming = ONE_MOMENT,
+    localize_only: bool = False,
 ) -> Slam:
-    """The SLAM object of a run that starts from a map.
+    """The SLAM object of a run that starts from a map; ``timing`` is that of the frames to come.
 
     Raises:
         ConfigError: There is no such device, or the settings do not fit the map.
@@ -151,7 +167,7 @@ def open_map(
         InputError: The map was made with another camera.
     """
     check_device(device)
-    slam = Slam.load(path, device, config=config, localize_only=localize_only)
+    slam = Slam.load(path, device, config=config, localize_only=localize_only, timing=timing)
     if slam.intrinsics != intrinsics:
         raise InputError(f"{path} was made with another camera: {slam.intrinsics}, the sequence has {intrinsics}")
     slam.forget_pose()

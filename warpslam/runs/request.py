@@ -196,10 +196,13 @@ class SequenceFacts:
     intrinsics: dict[str, Any]
     """Its camera, by field."""
 
+    timing: dict[str, Any]
+    """When its pixels are taken, by field."""
+
     @classmethod
     def of(cls, sequence: RgbdSequence) -> SequenceFacts:
         """The facts of a sequence as it is now."""
-        return cls(sequence.name, len(sequence), asdict(sequence.intrinsics))
+        return cls(sequence.name, len(sequence), asdict(sequence.intrinsics), asdict(sequence.timing))
 
 
 def differences(was: dict[str, Any], is_now: dict[str, Any]) -> list[str]:

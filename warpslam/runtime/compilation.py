@@ -28,10 +28,12 @@ _STAGES = (
     "kernels.losses",
     "kernels.grid",
     "views",
+    "direct",
 )
 _PYTHON_MODULES = {
     "warpslam.rays": ("pixels", "rays", "rejection", "samples"),
-    "warpslam.views": ("frustum", "images", "seen", "visibility"),
+    "warpslam.direct": ("direct.images", "direct.points", "direct.registration"),
+    "warpslam.views": ("frustum", "images", "rectify", "seen", "visibility"),
     **{f"warpslam.decoder_{target}": ("decoder.build",) for target in ("cpu", "cuda")},
     **{f"warpslam.imap_{target}": ("imap_network",) for target in ("cpu", "cuda")},
 }

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import NO_MOTION, FrameMotion, Intrinsics
 from warpslam.errors import MapSizeError
 from warpslam.kernels import images as image_kernels
+from warpslam.scene.rectification import Rectifier
 
 _Image = tuple[np.ndarray, np.ndarray, float]
 
@@ -23,6 +24,9 @@ class ImagePool:
     On the device an image lies in a slot: colour as uint8, depth as uint16 times a scale of its own, which keeps depth
     to 1/131070 of the image's largest depth (0.04 mm at 5 m). Slot 0 is the current frame; the others are a cache of
     the images that `bring` was asked for last. Which slot an image is in changes no result.
+
+    Images are kept as they were taken. A slot holds the image as it was taken, or rectified by how the camera moved
+    meanwhile: slot 0 from `rectify_current` on, until the next `set`, and the others if `bring` was told of a motion.
 
     Args:
         camera: Its image size.
@@ -36,6 +40,12 @@ class ImagePool:
         self.max_slots = int(min(max_gigabytes * 1e9 / image_bytes, 1 << 30))
         self._kept: list[CompactImage | Future[CompactImage]] = []
         self._slot_of: dict[int, int] = {}  # by image, the one used longest ago first
+        self._motion_of: dict[int, FrameMotion] = {}  # by image that has a slot: what it was rectified by
+        self._rectifier = Rectifier(camera, device)
+        # What slot 0 held before it was rectified, and where other images are before they are; allocated when needed.
+        self._raw_current: tuple[wp.array, wp.array, wp.array] | None = None
+        self._raw: tuple[wp.array, wp.array, wp.array] | None = None
+        self.motion = NO_MOTION
         self._allocate(max(min(capacity, self.max_slots), 1))
         size = (camera.height, camera.width)
         self._metres = wp.zeros(size, dtype=float, device=device)
@@ -65,10 +75,16 @@ class ImagePool:
         """Put into slot 0 what the other pool holds there."""
         for target, source in zip(self.arrays, other.arrays, strict=True):
             wp.copy(target, source, count=source.size // source.shape[0])
-        self._current = other._current
+        self._current, self.motion = other._current, other.motion
+        if other._raw_current is not None:
+            self._raw_current = self._raw_current or self._rectifier.new_image()
+            for target, source in zip(self._raw_current, other._raw_current, strict=True):
+                wp.copy(target, source)
 
     def set(self, slot: int, rgb: np.ndarray, depth: np.ndarray) -> None:
         """Store an image: uint8 (H, W, 3) and float32 (H, W) [m]."""
+        if slot == 0:
+            self.motion = NO_MOTION
         if self._upload is None:
             self._write(slot, rgb, *_quantized(depth))
             return
@@ -79,9 +95,32 @@ class ImagePool:
         if slot == 0:
             self._current = None
 
+    def rectify_current(self, motion: FrameMotion) -> None:
+        """Have slot 0 hold the current image as a camera would have taken it that moved so, but took all at once at the
+        middle row of colour; from the image as it was taken, however often it is called.
+        """
+        if motion == self.motion or (motion.is_none and self.motion.is_none):
+            self.motion = motion
+            return
+        self._raw_current = self._raw_current or self._rectifier.new_image()
+        if self.motion.is_none:
+            for raw, array in zip(self._raw_current, self.arrays, strict=True):
+                wp.copy(raw, array, count=raw.size)
+        if motion.is_none:
+            for raw, array in zip(self._raw_current, self.arrays, strict=True):
+                wp.copy(array, raw, count=raw.size)
+        else:
+            self._rectifier.rectify(self._raw_current, motion, self.arrays)
+        self.motion = motion
+
     def add(self, rgb: np.ndarray, depth: np.ndarray) -> int:
         """Keep an image for `bring`; returns its number."""
         self._kept.append(CompactImage.of(rgb, *_quantized(depth)))
+        return len(self._kept) - 1
+
+    def add_kept(self, rgb: np.ndarray, units: np.ndarray, scale: float) -> int:
+        """Keep an image as `current` returned it for `bring`; returns its number."""
+        self._kept.append(CompactImage.of(rgb, units, scale))
         return len(self._kept) - 1
 
     def keep_current(self) -> int:
@@ -92,6 +131,7 @@ class ImagePool:
         if 1 + len(self._slot_of) < self.rgb.shape[0]:
             # The next window will want it: a copy now spares unpacking it then.
             slot = self._slot_of[image] = self._free_slot([])
+            self._motion_of[image] = self.motion
             for array in self.arrays:
                 wp.copy(array[slot : slot + 1], array[:1])
         return image
@@ -103,13 +143,18 @@ class ImagePool:
             found = self._kept[image] = found.result()
         return found
 
-    def bring(self, images: Sequence[int]) -> list[int]:
+    def bring(self, images: Sequence[int], motions: Sequence[FrameMotion] = ()) -> list[int]:
         """Slots of some images, which are on the device until the next call.
+
+        Args:
+            images: Their numbers.
+            motions: What each is rectified by; without any, images are as they were taken.
 
         Raises:
             MapSizeError: They do not fit into the memory set for them.
         """
-        wanted = list(dict.fromkeys(images))
+        motion_of = dict(zip(images, motions, strict=True)) if motions else dict.fromkeys(images, NO_MOTION)
+        wanted = list(motion_of)
         if 1 + len(wanted) > self.max_slots:
             raise MapSizeError(_too_many_images(self.camera, 1 + len(wanted), self.max_slots))
         while 1 + len(self._slot_of.keys() | set(wanted)) > self.rgb.shape[0] < self.max_slots:
@@ -118,17 +163,27 @@ class ImagePool:
             for source, target in zip(old, self.arrays, strict=True):
                 wp.copy(target, source, count=source.size)
         for image in wanted:
-            slot = self._slot_of.pop(image, None)
-            if slot is None:
-                slot = self._free_slot(wanted)
+            slot, motion = self._slot_of.pop(image, None), motion_of[image]
+            if slot is None or not _same(motion, self._motion_of[image]):
+                slot = self._free_slot(wanted) if slot is None else slot
                 self._write(slot, *self.kept(image).unpack(self.camera))
-            self._slot_of[image] = slot
+                self._rectify(slot, motion)
+            self._slot_of[image], self._motion_of[image] = slot, motion
         return [self._slot_of[image] for image in images]
 
     def _free_slot(self, wanted: list[int]) -> int:
         if 1 + len(self._slot_of) < self.rgb.shape[0]:
             return 1 + len(self._slot_of)
         return self._slot_of.pop(next(image for image in self._slot_of if image not in wanted))
+
+    def _rectify(self, slot: int, motion: FrameMotion) -> None:
+        if motion.is_none:
+            return
+        self._raw = self._raw or self._rectifier.new_image()
+        target = self.rgb[slot : slot + 1], self.depth[slot : slot + 1], self.scale[slot : slot + 1]
+        for raw, array in zip(self._raw, target, strict=True):
+            wp.copy(raw, array)
+        self._rectifier.rectify(self._raw, motion, target)
 
     def _write(self, slot: int, rgb: np.ndarray, depth: np.ndarray, scale: float) -> None:
         self.rgb[slot].assign(np.ascontiguousarray(rgb))
@@ -145,20 +200,31 @@ class ImagePool:
         return self._metres
 
     def current(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """What slot 0 holds: colour, uint16 depth, and its scale."""
+        """The current image as it was taken: colour, uint16 depth, and its scale."""
         if self._current is None:
-            rgb, depth, scale = (array[:1].numpy()[0] for array in self.arrays)
+            arrays = self.arrays
+            if not self.motion.is_none:
+                assert self._raw_current is not None
+                arrays = self._raw_current
+            rgb, depth, scale = (array[:1].numpy()[0] for array in arrays)
             self._current = rgb, depth, float(scale)
         return self._current
 
     def current_depth(self) -> np.ndarray:
         """Depth of slot 0 as the kernels read it [m], float32 (H, W)."""
-        _, depth, scale = self.current()
+        if self.motion.is_none:
+            _, depth, scale = self.current()
+        else:
+            depth, scale = self.depth[0].numpy(), self.scale[:1].numpy()[0]
         return depth.astype(np.float32) * np.float32(scale)
 
-    def restore(self, current: tuple[np.ndarray, np.ndarray, float], images: list[CompactImage]) -> None:
-        """Put back what `current` and `images` were."""
+    def restore(
+        self, current: tuple[np.ndarray, np.ndarray, float], motion: FrameMotion, images: list[CompactImage]
+    ) -> None:
+        """Put back what `current`, `motion` and the kept images were."""
+        self.motion = NO_MOTION
         self._write(0, *current)
+        self.rectify_current(motion)
         self._kept, self._slot_of = list(images), {}
 
     @property
@@ -194,6 +260,10 @@ class _Upload:
         wp.get_stream(self._metres.device).record_event(self._done)
         self._is_under_way = True
         return self._metres
+
+
+def _same(a: FrameMotion, b: FrameMotion) -> bool:
+    return a == b or (a.is_none and b.is_none)
 
 
 def check_window_fits(camera: Intrinsics, max_gigabytes: float, window: int) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import NO_MOTION, FrameMotion, Intrinsics
 
 OVERLAP_PIXELS = 100
 OVERLAP_SAMPLES = 16
@@ -23,6 +23,8 @@ class Keyframe:
     """Its number in the pool."""
     pose: np.ndarray
     """T_world_camera, float64 (4, 4), refined by bundle adjustment."""
+    motion: FrameMotion = NO_MOTION
+    """How the camera moved meanwhile: its image is rectified by it when it is brought, anew if this has changed."""
 
 
 def overlap_fractions(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import ONE_MOMENT, Intrinsics, SensorTiming
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,8 @@ class Frame:
     """z-depth [m], float32, shape (H, W), 0 = missing."""
     T_world_camera: np.ndarray | None = None
     """Ground-truth camera-to-world transform, float64, shape (4, 4), OpenCV axes; None where unknown."""
+    depth_timestamp: float | None = None
+    """Time of the depth image [s], where it has one of its own."""
 
 
 class RgbdSequence(ABC):
@@ -33,11 +35,13 @@ class RgbdSequence(ABC):
     name: Short name, used for the run folder.
     intrinsics: Camera of the frames as returned, that is after undistortion, resizing and cropping.
     preset: Name of the settings that suit the sequence (see `warpslam.config.PRESETS`).
+    timing: When the pixels of the frames, as returned, are taken.
     """
 
     name: str
     intrinsics: Intrinsics
     preset: str = "default"
+    timing: SensorTiming = ONE_MOMENT
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -48,6 +52,10 @@ class RgbdSequence(ABC):
     def __iter__(self) -> Iterator[Frame]:
         for index in range(len(self)):
             yield self[index]
+
+    def as_published(self) -> RgbdSequence:
+        """The sequence with frames as the paper's code takes them; itself where that makes no difference."""
+        return self
 
     def ground_truth(self) -> np.ndarray | None:
         """All ground-truth poses, float64, shape (N, 4, 4), NaN-filled where one is unknown; None if there are none."""

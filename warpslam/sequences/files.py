@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import operator
 import re
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ _FIRST_FRAMES = 10
 
 
 class FileSequence(RgbdSequence):
-    """RGB-D files on disk. Colour is undistorted, then colour and depth are resized and cropped.
+    """RGB-D files on disk. Colour (and depth, if it is distorted alike) is undistorted, then both are resized, cropped.
 
     Args:
         folder: Folder of the sequence; gives it its name.
@@ -29,6 +30,7 @@ class FileSequence(RgbdSequence):
         depth_files: Depth images, as many.
         poses: Camera-to-world transforms, OpenCV axes, shape (N, 4, 4), NaN where unknown, or None.
         timestamps: Times [s], shape (N,); index / 30 if None.
+        depth_timestamps: Times of the depth images [s], shape (N,), where they have their own.
         color_size_may_differ: Resize colour to the size of the depth image instead of refusing another size.
         remarks: What was left out in making the list of frames, for `warpslam check`.
 
@@ -45,6 +47,7 @@ class FileSequence(RgbdSequence):
         *,
         poses: np.ndarray | None = None,
         timestamps: np.ndarray | None = None,
+        depth_timestamps: np.ndarray | None = None,
         color_size_may_differ: bool = False,
         remarks: Sequence[str] = (),
     ) -> None:
@@ -62,13 +65,21 @@ class FileSequence(RgbdSequence):
             )
         self.name = folder.resolve().name
         self.calibration = calibration
-        self.intrinsics = calibration.intrinsics
+        self.intrinsics, self.timing = calibration.intrinsics, calibration.timing
         self.timestamps = np.arange(len(rgb_files)) / FRAME_RATE if timestamps is None else timestamps
+        self.depth_timestamps = depth_timestamps
         self._rgb_files, self._depth_files = list(rgb_files), list(depth_files)
         self._poses = None if poses is None or np.isnan(poses).all() else poses
         self._color_size_may_differ = color_size_may_differ
         self.remarks = tuple(remarks)
         self._check_first_frames()
+
+    def as_published(self) -> FileSequence:
+        """The sequence with frames resized and cropped as the paper's code does it, depth left as it is stored."""
+        published = copy.copy(self)
+        published.calibration = self.calibration.as_published()
+        published.intrinsics, published.timing = published.calibration.intrinsics, published.calibration.timing
+        return published
 
     def __len__(self) -> int:
         return len(self._rgb_files)
@@ -82,7 +93,8 @@ class FileSequence(RgbdSequence):
         pose = None
         if self._poses is not None and np.isfinite(self._poses[index]).all():
             pose = self._poses[index].copy()
-        return Frame(index, float(self.timestamps[index]), rgb, depth, pose)
+        depth_time = None if self.depth_timestamps is None else float(self.depth_timestamps[index])
+        return Frame(index, float(self.timestamps[index]), rgb, depth, pose, depth_time)
 
     def ground_truth(self) -> np.ndarray | None:
         """All poses, float64, shape (N, 4, 4), NaN where unknown; None if the sequence has none."""
@@ -122,6 +134,8 @@ class FileSequence(RgbdSequence):
             import cv2
 
             rgb = cv2.remap(rgb, *self._undistortion, interpolation=cv2.INTER_LINEAR)
+            if self.calibration.depth_distorted:
+                depth = cv2.remap(depth, *self._undistortion, interpolation=cv2.INTER_NEAREST)
         if self.calibration.resize is not None:
             rgb, depth = _resize(rgb, depth, *self.calibration.resize)
         border = self.calibration.crop

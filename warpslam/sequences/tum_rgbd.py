@@ -70,6 +70,7 @@ class TumRgbdSequence(FileSequence):
             [depth for _, depth in frames],
             poses=poses,
             timestamps=rgb_times[kept],
+            depth_timestamps=depth_times[depth_index[kept]],
             remarks=remarks,
         )
 

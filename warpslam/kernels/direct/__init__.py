@@ -1,0 +1,1 @@
+"""Direct registration of RGB-D frames against keyframes: pyramids, points, residuals, Gauss-Newton."""

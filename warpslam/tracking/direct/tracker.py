@@ -1,0 +1,790 @@
+"""The camera by direct registration against keyframes: which starts, which keyframes, and when a pose is believed.
+
+A frame is registered to the reference keyframe from where constant speed foretells it. If the outcome is beyond doubt,
+that is all; if not, the exhaustive search goes over rotations of the smallest images, over the motions that depth
+leaves open and over zero motion, then to the frame before, then to older keyframes. An accepted pose is registered to
+the keyframes of largest overlap at once. A frame that sees much else becomes a keyframe, and those around it are
+refined together (`warpslam.tracking.direct.window`); frames hang on their keyframe and follow it.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpslam.camera import NO_MOTION, FrameMotion, Intrinsics
+from warpslam.config import DirectConfig
+from warpslam.frames import AdmittedFrame
+from warpslam.kernels.direct import equations as eq
+from warpslam.kernels.direct import points, registration
+from warpslam.poses import inverse, motion_between, motion_of, orthonormalized, twist_of
+from warpslam.scene.image_pool import ImagePool
+from warpslam.scene.keyframes import Keyframe
+from warpslam.tracking.direct.measures import Measures
+from warpslam.tracking.direct.pyramid import PyramidPlan, records
+from warpslam.tracking.direct.registrar import Floors, Registrar, new_tasks
+from warpslam.tracking.direct.window import Pose, refine_window
+from warpslam.trajectory import TWIST_STEPS, FrameHistory, Located
+
+RECENT = 4
+"""Rows of images for frames that are no keyframes (yet)."""
+CACHED = 24
+"""Rows of images of keyframes; those of others are built anew when they are wanted."""
+MIN_OVERLAP = 0.35
+"""Of a keyframe in the joint registration."""
+NEAR_KEYFRAMES = 24
+"""Keyframes, the nearest by pose, whose overlap is looked at."""
+DEGREE = 0.02
+"""Metres that a degree counts for when keyframes are ordered by nearness."""
+MAX_JOINT_STEP, MAX_JOINT_TURN = 0.1, 5.0
+"""Further than this [m], [degrees] the joint registration must not take a pose."""
+SCRATCH = 0
+"""Row of points that hold no keyframe's."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A frame registered to a keyframe."""
+
+    keyframe: int
+    """Number of the keyframe, or `BEFORE` for the frame before."""
+    T_frame_keyframe: np.ndarray
+    """float64 (4, 4)."""
+    exposure: np.ndarray
+    """Gain and bias (2,)."""
+    cost: float
+    """Mean robust cost, by which attempts are compared."""
+    measures: Measures
+    """At the level where poses are judged."""
+    grey_scale: float
+    """Spread of the photometric residuals [grey values]."""
+    ok: bool = True
+    moved: float = 0.0
+    """How far the image moved from the start [px of the middle level]."""
+
+
+@dataclass(frozen=True)
+class _Anchor:
+    """The keyframe that a frame hangs on."""
+
+    keyframe: int
+    T_keyframe_frame: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Before:
+    """The last frame that was OK, as it may yet become a keyframe."""
+
+    index: int
+    rgb: np.ndarray
+    depth: np.ndarray
+    kept: tuple[np.ndarray, np.ndarray, float] | None
+    """Its images as the pool held them; None where they are on a GPU."""
+
+
+@dataclass(frozen=True)
+class DirectState:
+    """All that the next frame depends on beside poses and images, for N frames."""
+
+    anchors: np.ndarray
+    """Keyframe that a frame hangs on, -1 = none, int64 (N,)."""
+    relative: np.ndarray
+    """T_keyframe_frame, float64 (N, 4, 4)."""
+    overlap: np.ndarray
+    """Share of each keyframe that the last frame sees, float64 (keyframes,); NaN = not looked at."""
+    reference: int
+    """Keyframe that frames are registered to."""
+    before: int
+    """The last frame that was OK, -1 = none."""
+    typical: tuple[float, float]
+    """Running means of the photometric scale and of the cost; infinite = none yet."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Those that are arrays, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
+
+
+class DirectTracker:
+    """Finds the pose of the frame in slot 0 of the image pool, and makes keyframes.
+
+    Args:
+        camera: Camera of all frames.
+        config: Settings.
+        max_depth: Depth beyond this is not used [m].
+        device: Where it computes.
+        keyframes: The list that keyframes are added to.
+        images: Where their images are kept.
+    """
+
+    def __init__(
+        self,
+        camera: Intrinsics,
+        config: DirectConfig,
+        max_depth: float,
+        device: wp.Device,
+        keyframes: list[Keyframe],
+        images: ImagePool,
+        readout: float = 0.0,
+    ) -> None:
+        self.camera, self.config, self.device = camera, config, device
+        self.keyframes, self.images, self.readout = keyframes, images, readout
+        self.plan = PyramidPlan.of(camera)
+        floors = Floors(config.grey_floor, config.depth_floor)
+        self.registrar = Registrar(self.plan, RECENT + CACHED, max_depth, floors, device)
+        self._row_of: OrderedDict[int, int] = OrderedDict()  # by frame, the one used longest ago first
+        self._anchors: list[_Anchor | None] = []
+        self._motions: dict[int, FrameMotion] = {}  # of the latest frames
+        self._smallest: list[np.ndarray] = []
+        self._mean_depth: list[float] = []
+        self._overlap: dict[int, float] = {}  # with the last frame, by keyframe
+        self._reference = 0
+        self._typical_scale = np.inf
+        self._typical_cost = np.inf
+        self._before: _Before | None = None
+        self._rotations = rotation_grid(config.search_span)
+        self.counts = {"sure": 0, "searched": 0}
+
+    # -- what Slam asks ------------------------------------------------------------------------------------------
+
+    def place(self, frame: AdmittedFrame, pose: np.ndarray) -> None:
+        """A frame whose pose is given; it becomes a keyframe."""
+        self._build_missing()
+        self._load(frame)
+        self._set_motion(frame.index, FrameMotion(depth_offset=frame.depth_offset, readout=self.readout))
+        self._add_keyframe(frame.index, pose, self.images.keep_current())
+        self._note(frame)
+
+    def locate(self, frame: AdmittedFrame, history: FrameHistory) -> Located:
+        """Pose of the frame, which comes after the frames of ``history``."""
+        self._build_missing()
+        row = self._load(frame)
+        self._foretell_motion(frame, history)
+        starts = history.starts(constant_speed=True)
+        if not self.keyframes:
+            return Located(np.eye(4), "it is not known where the camera starts: there is no keyframe to compare with")
+        best: Attempt | None = None
+        done: tuple[Attempt, np.ndarray, np.ndarray] | None = None
+        if history.was_known:
+            done = self._follow(row, self._reference, starts[0], frame, history)
+            if self._is_sure(done[0]):
+                self.counts["sure"] += 1
+            else:
+                best, done = done[0], None
+        if done is None:
+            self.counts["searched"] += 1
+            best = self._look_everywhere(row, frame, history, starts, best)
+            if best is None or not self._is_good(best):
+                self._settle(frame, None)
+                self._keep_before(history)
+                return Located(history.last_pose, _why_lost(best), not history.was_known)
+            pose = self._pose_of(best)
+            self._overlap = self._overlaps_at(row, pose)
+            done = self._follow(row, best.keyframe, pose, frame, history, best)
+        attempt, T_frame_reference, H = done
+        self._typical_scale = (
+            attempt.grey_scale
+            if not np.isfinite(self._typical_scale)
+            else 0.9 * self._typical_scale + 0.1 * attempt.grey_scale
+        )
+        self._typical_cost = (
+            attempt.cost if not np.isfinite(self._typical_cost) else 0.9 * self._typical_cost + 0.1 * attempt.cost
+        )
+        self._reference = attempt.keyframe
+        reference = self.keyframes[attempt.keyframe]
+        pose = orthonormalized(reference.pose @ inverse(T_frame_reference))
+        self._settle(frame, _Anchor(attempt.keyframe, inverse(reference.pose) @ pose))
+        self._note_motion(frame, pose, history)
+        anchor = self._anchors[frame.index]
+        assert anchor is not None
+        pose = reference.pose @ anchor.T_keyframe_frame
+        after_loss = not history.was_known
+        measures = attempt.measures
+        located = Located(
+            pose,
+            after_loss=after_loss,
+            inliers=measures.agreement,
+            loss=attempt.cost,
+        )
+        self._note(frame)
+        if self._is_new(row, pose, attempt):
+            old = self._revisited(row, pose, attempt.keyframe)
+            if old is not None:
+                self._reference = old
+            else:
+                self._add_keyframe(frame.index, pose, self.images.keep_current())
+                self._refine(history)
+                located = Located(
+                    self.keyframes[-1].pose.copy(),
+                    after_loss=after_loss,
+                    inliers=measures.agreement,
+                    loss=attempt.cost,
+                )
+        return located
+
+    # -- registration --------------------------------------------------------------------------------------------
+
+    @property
+    def judged(self) -> int:
+        """The level where poses are judged."""
+        return min(1, self.plan.top)
+
+    def _task(self, count: int = 1) -> Any:
+        tasks = new_tasks(count)
+        tasks["grey"], tasks["depth"] = self.config.grey_weight, self.config.depth_weight
+        return tasks
+
+    def _follow(
+        self,
+        row: int,
+        reference: int,
+        start: np.ndarray,
+        frame: AdmittedFrame,
+        history: FrameHistory,
+        best: Attempt | None = None,
+    ) -> tuple[Attempt, np.ndarray, np.ndarray]:
+        """Register to the reference from a pose, then to all keyframes of large overlap; one reading of the device.
+
+        best: What the pose comes from: only the largest level is left to do.
+
+        Returns:
+            The attempt, the pose as T_frame_reference, and the normal matrix (6, 6) of the pose.
+        """
+        W = self.keyframes[reference].pose
+        task = self._task()
+        task["keyframe"], task["row"], task["top"], task["low"] = self._points_of(reference), row, self.plan.middle, 0
+        task["cost_level"] = 0
+        task["T"] = inverse(start) @ W
+        if best is not None:
+            task["top"], task["exposure"], task["T"] = 0, best.exposure, best.T_frame_keyframe
+        started = self.registrar.start(task)
+        wanted = [k for k, share in sorted(self._overlap.items(), key=lambda item: -item[1]) if share > MIN_OVERLAP]
+        joined = [reference, *[k for k in wanted if k != reference]][: max(self.config.joint, 1)]
+        to_reference = inverse(W) @ np.array([self.keyframes[k].pose for k in joined])
+        joint = records(registration.Joint)
+        joint["row"], joint["count"], joint["level"] = row, len(joined), 0
+        joint["keyframes"][0, : len(joined)] = [self._points_of(k) for k in joined]
+        joint["iterations"] = self.config.joint_iterations if self.config.joint > 0 else 0
+        joint["grey"], joint["depth"] = self.config.grey_weight, self.config.depth_weight
+        self._ask_motion(joint, frame, history, W)
+        final = self.registrar.join(started, joint, to_reference)
+        near = self._nearest(start)
+        shares = self.registrar.overlaps(
+            row,
+            final,
+            [self._points_of(k) for k in near],
+            inverse(W) @ np.array([self.keyframes[k].pose for k in near]),
+        )
+        result, last = started.numpy()[0], final.numpy()[0]
+        self._overlap = dict(zip(near, shares.numpy()[: len(near)].tolist(), strict=True))
+        attempt = replace(self._attempt(reference, result), moved=self._shift(row, task[0]["T"], result["T"]))
+        if best is not None:
+            attempt = replace(attempt, cost=best.cost, measures=best.measures, grey_scale=best.grey_scale)
+        T, T_joint = (np.asarray(one["T"], np.float64) for one in (result, last))
+        step, turn = motion_between(T_joint, T)
+        if step > MAX_JOINT_STEP or turn > MAX_JOINT_TURN:
+            T_joint = T
+        self._seen = Measures.of(result["record_0"])
+        return attempt, T_joint, np.asarray(last["H"], np.float64)
+
+    def _shift(self, row: int, a: np.ndarray, b: np.ndarray) -> float:
+        """How far two transforms put points apart, about [px of the middle level]."""
+        step, turn = motion_between(np.asarray(a, np.float64), np.asarray(b, np.float64))
+        focal = float(self.plan.levels[self.plan.middle]["fx"])
+        return float(focal * (step / self.registrar.mean_depth(row) + np.radians(turn)))
+
+    def _attempt(self, keyframe: int, result: np.ndarray) -> Attempt:
+        record = result["record_1"] if self.judged == 1 else result["record_0"]
+        return Attempt(
+            keyframe,
+            np.asarray(result["T"], np.float64),
+            np.asarray(result["exposure"], np.float64),
+            float(result["end_cost"]),
+            Measures.of(record),
+            float(record[eq.GREY_SCALE]),
+            bool(result["ok"]) and bool(np.isfinite(result["T"]).all()),
+        )
+
+    def _is_sure(self, attempt: Attempt) -> bool:
+        """Whether nothing needs to be searched for."""
+        m, config = attempt.measures, self.config
+        limit = max(6.0, 2.0 * self._typical_scale)
+        return (
+            attempt.ok
+            and m.agreement > config.sure_agreement
+            and m.correlation > config.sure_correlation
+            and m.view > 0.4
+            and m.known > 0.2
+            and attempt.grey_scale < limit
+            and attempt.cost < max(config.sure_cost * self._typical_cost, 0.5)
+            and attempt.moved < config.sure_shift
+        )
+
+    def _is_good(self, attempt: Attempt) -> bool:
+        """Whether the pose can be believed."""
+        m, config = attempt.measures, self.config
+        return (
+            attempt.ok
+            and m.agreement > config.lost_agreement
+            and m.correlation > config.lost_correlation
+            and m.view > config.lost_view
+            and m.known > config.lost_known
+        )
+
+    # -- search --------------------------------------------------------------------------------------------------
+
+    def _look_everywhere(
+        self,
+        row: int,
+        frame: AdmittedFrame,
+        history: FrameHistory,
+        starts: Sequence[np.ndarray],
+        best: Attempt | None,
+    ) -> Attempt | None:
+        """At the reference, at the frame before, at older keyframes, until a pose is believed."""
+        last = history.last_known
+        if last is not None:
+            poses = [*starts, *self._turned(row, starts)]
+            found = self._search(row, self._points_of(self._reference), self._reference, poses, best)
+            best = _better(best, found, by_cost=True)
+            if best is not None and self._is_good(best):
+                return best
+            if history.was_known and self._before is not None and self._before.index != self._reference_frame:
+                self._keep_before(history)
+                found = self._search(row, self._points_of(self._reference), self._reference, poses, None)
+                best = _better(best, found)
+                if best is not None and self._is_good(best):
+                    return best
+        return _better(best, self._relocalize(row))
+
+    def _turned(self, row: int, starts: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Starts whose rotation was found on the smallest images of the frame before."""
+        before = self._row_before()
+        if before is None or not starts:
+            return []
+        rotations = self._best_rotations(self.registrar.smallest(before)[None], row, self.config.search_kept)[0]
+        last = starts[-1]
+        shift = inverse(last) @ starts[0]
+        poses = []
+        for R in rotations:
+            turn = np.eye(4)
+            turn[:3, :3] = R.T
+            poses.append(last @ turn)
+            if len(starts) > 1:
+                turn = turn.copy()
+                turn[:3, 3] = shift[:3, 3]
+                poses.append(last @ turn)
+        return poses
+
+    def _best_rotations(self, smallest: np.ndarray, row: int, count: int) -> list[list[np.ndarray]]:
+        """For each of some images the rotations into the frame that fit best and differ by more than 5 degrees."""
+        scores = self.registrar.rotations(smallest, row, self._rotations)
+        out = []
+        for line in scores:
+            found: list[np.ndarray] = []
+            for n in np.argsort(line, kind="stable")[:40]:
+                R = self._rotations[n]
+                if all(np.trace(R.T @ other) < 1.0 + 2.0 * np.cos(np.radians(5.0)) for other in found):
+                    found.append(R)
+                if len(found) == count:
+                    break
+            out.append(found)
+        return out
+
+    def _search(
+        self, row: int, points_row: int, keyframe: int, poses: Sequence[np.ndarray], best: Attempt | None
+    ) -> Attempt | None:
+        """The cheapest of many starts: each as it is and after the smallest levels, the best three refined."""
+        W = self.keyframes[keyframe].pose
+        top, middle = self.plan.top, self.plan.middle
+        tasks = self._task(len(poses))
+        tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, middle
+        tasks["top"], tasks["low"], tasks["iterations"] = top, max(top - 1, 0), 6
+        tasks["T"] = inverse(np.asarray(poses)) @ W
+        results = self.registrar.register(tasks)
+        tried = [(float(r["start_cost"]), t["T"], np.array([1.0, 0.0])) for t, r in zip(tasks, results, strict=True)]
+        tried += [(float(r["end_cost"]), r["T"], r["exposure"]) for r in results if r["ok"]]
+        tried.sort(key=lambda one: one[0])
+        if self.config.search_weak:
+            tried += self._weak_starts(row, points_row, [tasks[0]["T"], tried[0][1]])
+            tried.sort(key=lambda one: one[0])
+        chosen: list[tuple[float, np.ndarray, np.ndarray]] = []
+        for one in tried:
+            if not np.isfinite(one[1]).all():
+                continue
+            motions = [motion_between(other[1].astype(np.float64), one[1].astype(np.float64)) for other in chosen]
+            if all(step >= 0.015 or turn >= 0.7 for step, turn in motions):
+                chosen.append(one)
+            if len(chosen) == 3:
+                break
+        tasks = self._task(len(chosen))
+        tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, 0
+        tasks["top"], tasks["low"] = middle, 0
+        for task, (_, T, exposure) in zip(tasks, chosen, strict=True):
+            task["T"], task["exposure"] = T, exposure
+        for result in self.registrar.register(tasks):
+            found = self._attempt(keyframe, result)
+            if found.ok:
+                best = _better(best, found, by_cost=True)
+        return best
+
+    def _weak_starts(
+        self, row: int, points_row: int, transforms: Sequence[np.ndarray]
+    ) -> list[tuple[float, np.ndarray, np.ndarray]]:
+        """Poses along the two motions that depth determines least: a corridor's length, a wall's plane."""
+        middle = self.plan.middle
+        tasks = self._task(len(transforms))
+        tasks["keyframe"], tasks["row"], tasks["top"], tasks["low"] = points_row, row, middle, middle
+        tasks["grey"], tasks["iterations"] = 0.0, -1
+        tasks["T"] = np.asarray(transforms)
+        z = self.registrar.mean_depth(row)
+        D = np.diag([z, z, z, 1.0, 1.0, 1.0])
+        step = 1.0 / float(self.plan.levels[middle]["fx"])
+        steps = [n for n in range(-self.config.search_steps, self.config.search_steps + 1) if n]
+        moves = []
+        for result in self.registrar.register(tasks):
+            _, axes = np.linalg.eigh(D @ np.asarray(result["H"], np.float64) @ D)
+            T = np.asarray(result["T"], np.float64)
+            moves += [motion_of(D @ axes[:, axis] * (n * step)) @ T for axis in range(2) for n in steps]
+        tasks = self._task(len(moves))
+        tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, middle
+        tasks["top"], tasks["low"], tasks["iterations"] = middle, middle, -2
+        tasks["T"] = np.asarray(moves)
+        costs = self.registrar.register(tasks)["start_cost"]
+        found: list[tuple[float, np.ndarray, np.ndarray]] = []
+        for n in np.argsort(costs, kind="stable"):
+            T = moves[n]
+            motions = [motion_between(other[1], T) for other in found]
+            if all(shift > 2.5 * step * z or turn > 3.0 for shift, turn in motions):
+                found.append((float(costs[n]), T, np.array([1.0, 0.0])))
+            if len(found) == 6:
+                break
+        return found
+
+    def _relocalize(self, row: int) -> Attempt | None:
+        """At the keyframes whose smallest image fits best under some rotation."""
+        first = max(0, len(self.keyframes) - self.config.relocalization_keyframes)
+        numbers = list(range(first, len(self.keyframes)))
+        scores = self.registrar.rotations(np.array([self._smallest[k] for k in numbers]), row, self._rotations)
+        best: Attempt | None = None
+        for n in np.argsort(scores.min(axis=1), kind="stable")[:4]:
+            keyframe = numbers[n]
+            turn = np.eye(4)
+            turn[:3, :3] = self._rotations[scores[n].argmin()].T
+            pose = self.keyframes[keyframe].pose @ turn
+            best = _better(best, self._search(row, self._points_of(keyframe), keyframe, [pose], None))
+        return best
+
+    # -- keyframes -----------------------------------------------------------------------------------------------
+
+    def _is_new(self, row: int, pose: np.ndarray, attempt: Attempt) -> bool:
+        """Whether a frame sees so much else that it should be a keyframe."""
+        config, k = self.config, attempt.keyframe
+        step, turn = motion_between(self.keyframes[k].pose, pose)
+        return (
+            self._seen.view * self._seen.agreement < config.keyframe_overlap
+            or step > config.keyframe_step * self._mean_depth[k]
+            or turn > config.keyframe_turn
+        )
+
+    def _revisited(self, row: int, pose: np.ndarray, reference: int) -> int | None:
+        """An old keyframe that sees enough of the frame to serve again."""
+        config = self.config
+        best = max(self._overlap.items(), key=lambda item: item[1], default=None)
+        if best is None or best[1] <= config.keyframe_overlap or best[0] == reference:
+            return None
+        step, turn = motion_between(self.keyframes[best[0]].pose, pose)
+        far = 0.8 * config.keyframe_step * self.registrar.mean_depth(row)
+        return best[0] if step < far and turn < 0.8 * config.keyframe_turn else None
+
+    def _add_keyframe(self, index: int, pose: np.ndarray, image: int) -> None:
+        """Make a frame whose pyramid is built a keyframe, and the reference; ``image``: its number in the pool."""
+        number = len(self.keyframes)
+        motion = self._motions.get(index, NO_MOTION)
+        self.keyframes.append(Keyframe(index, image, orthonormalized(pose), motion))
+        self._take_up(number)
+        self._anchors[index] = _Anchor(number, np.eye(4))
+        self._overlap[number] = 1.0
+        self._reference = number
+
+    def _take_up(self, number: int) -> None:
+        """Choose the points of a keyframe."""
+        row = self._row(self.keyframes[number])
+        self.registrar.select(row, self._points_of(number))
+        self._smallest.append(self.registrar.smallest(row))
+        self._mean_depth.append(self.registrar.mean_depth(row))
+
+    def _build_missing(self) -> None:
+        """Take up keyframes that came from elsewhere: a file, or frames whose poses were given."""
+        for number in range(len(self._smallest), len(self.keyframes)):
+            self._take_up(number)
+
+    def _keep_before(self, history: FrameHistory) -> None:
+        """The last frame that was OK becomes a keyframe: it is what a lost camera is nearest to."""
+        before = self._before
+        if before is None or self._row_before() is None or before.index in (one.index for one in self.keyframes):
+            return
+        image = self.images.add(before.rgb, before.depth) if before.kept is None else self.images.add_kept(*before.kept)
+        self._add_keyframe(before.index, history.pose(before.index), image)
+
+    def _row_before(self) -> int | None:
+        """Where the images of the last frame that was OK are; None if they are gone."""
+        if self._before is None:
+            return None
+        index = self._before.index
+        if index in self._row_of:
+            return self._row_of[index]
+        return next((self._row(one) for one in reversed(self.keyframes) if one.index == index), None)
+
+    def _refine(self, history: FrameHistory) -> None:
+        """Refine the keyframes around the newest, and move the frames that hang on them."""
+        if self.config.window < 2 or len(self.keyframes) < 3:
+            return
+        newest = len(self.keyframes) - 1
+        near = self._ranked(newest)
+        active = list(dict.fromkeys([newest, *near]))[: self.config.window]
+        active += [k for k in range(newest - 1, -1, -1) if k not in active][: self.config.window - len(active)]
+        active.sort()
+        members = [Pose(self._points_of(k), self._row(self.keyframes[k]), self.keyframes[k].pose) for k in active]
+        poses = refine_window(
+            self.registrar,
+            members,
+            self.judged,
+            self.config.grey_weight,
+            self.config.depth_weight,
+            self.config.window_iterations,
+        )
+        moved = set()
+        for k, pose in zip(active, poses, strict=True):
+            if not np.array_equal(pose, self.keyframes[k].pose):
+                self.keyframes[k].pose = pose
+                moved.add(k)
+        for index, anchor in enumerate(self._anchors):
+            if anchor is not None and anchor.keyframe in moved and index < len(history):
+                history.correct(index, self.keyframes[anchor.keyframe].pose @ anchor.T_keyframe_frame)
+
+    def _ranked(self, number: int) -> list[int]:
+        """Keyframes that overlap one, most first."""
+        pose = self.keyframes[number].pose
+        shares = self._overlaps_at(self._row(self.keyframes[number]), pose)
+        return [k for k, share in sorted(shares.items(), key=lambda item: -item[1]) if share > 0.2]
+
+    def _overlaps_at(self, row: int, pose: np.ndarray) -> dict[int, float]:
+        near = self._nearest(pose)
+        transforms = inverse(pose) @ np.array([self.keyframes[k].pose for k in near])
+        shares = self.registrar.overlap(row, [self._points_of(k) for k in near], transforms)
+        return dict(zip(near, shares.tolist(), strict=True))
+
+    def _nearest(self, pose: np.ndarray) -> list[int]:
+        """Keyframes nearest to a pose, in their order."""
+        poses = np.array([keyframe.pose for keyframe in self.keyframes])
+        if len(poses) <= NEAR_KEYFRAMES:
+            return list(range(len(poses)))
+        step, turn = motion_between(poses, np.broadcast_to(pose, poses.shape)).T
+        return sorted(np.argsort(step + DEGREE * turn, kind="stable")[:NEAR_KEYFRAMES].tolist())
+
+    # -- frames --------------------------------------------------------------------------------------------------
+
+    @property
+    def _reference_frame(self) -> int:
+        return self.keyframes[self._reference].index
+
+    def _points_of(self, keyframe: int) -> int:
+        return keyframe + 1
+
+    def _pose_of(self, attempt: Attempt) -> np.ndarray:
+        return self.keyframes[attempt.keyframe].pose @ inverse(attempt.T_frame_keyframe)
+
+    def _load(self, frame: AdmittedFrame) -> int:
+        row = self._take_row(frame.index)
+        rgb, depth, scale = self.images.arrays
+        self.registrar.load(row, rgb[0], depth[0], scale[:1])
+        while len(self._anchors) <= frame.index:
+            self._anchors.append(None)
+        return row
+
+    def _row(self, keyframe: Keyframe) -> int:
+        """Where the images of a keyframe are."""
+        row = self._row_of.get(keyframe.index)
+        if row is not None:
+            self._row_of.move_to_end(keyframe.index)
+            return row
+        row = self._upload(keyframe.index, *self.images.kept(keyframe.image).unpack(self.camera))
+        self._set_motion(keyframe.index, keyframe.motion)
+        return row
+
+    def _upload(self, index: int, rgb: np.ndarray, units: np.ndarray, scale: float) -> int:
+        """Build the pyramid of an image that is kept."""
+        row, device = self._take_row(index), self.device
+        self.registrar.load(
+            row,
+            wp.array(rgb, dtype=wp.uint8, device=device),
+            wp.array(units, dtype=wp.uint16, device=device),
+            wp.array([scale], dtype=float, device=device),
+        )
+        return row
+
+    def _take_row(self, index: int) -> int:
+        if index in self._row_of:
+            return self._row_of[index]
+        if len(self._row_of) < self.registrar.rows:
+            row = len(self._row_of)
+        else:
+            row = self._row_of.popitem(last=False)[1]
+        self._row_of[index] = row
+        return row
+
+    def _settle(self, frame: AdmittedFrame, anchor: _Anchor | None) -> None:
+        self._anchors[frame.index] = anchor
+
+    def _note(self, frame: AdmittedFrame) -> None:
+        kept = self.images.current() if self.device.is_cpu else None
+        self._before = _Before(frame.index, frame.rgb if kept else frame.rgb.copy(), frame.depth, kept)
+
+    # -- saved ---------------------------------------------------------------------------------------------------
+
+    def state(self) -> DirectState:
+        """All of it as arrays."""
+        anchors = [-1 if anchor is None else anchor.keyframe for anchor in self._anchors]
+        relative = [np.eye(4) if anchor is None else anchor.T_keyframe_frame for anchor in self._anchors]
+        return DirectState(
+            anchors=np.array(anchors, np.int64),
+            relative=np.array(relative, np.float64).reshape(-1, 4, 4),
+            overlap=np.array([self._overlap.get(k, np.nan) for k in range(len(self.keyframes))], np.float64),
+            reference=self._reference,
+            before=-1 if self._before is None else self._before.index,
+            typical=(self._typical_scale, self._typical_cost),
+        )
+
+    def restore(self, state: DirectState, current: int | None, motion: FrameMotion) -> None:
+        """Go on from what `state` returned; keyframes and images are restored already.
+
+        current: The frame in slot 0. motion: How the camera moved meanwhile.
+        """
+        pairs = zip(state.anchors.tolist(), state.relative, strict=True)
+        self._anchors = [None if k < 0 else _Anchor(k, T.copy()) for k, T in pairs]
+        self._overlap = {k: share for k, share in enumerate(state.overlap.tolist()) if np.isfinite(share)}
+        self._reference = state.reference
+        self._typical_scale, self._typical_cost = state.typical
+        if state.before < 0:
+            return
+        rgb, units, scale = self.images.current()
+        depth = units.astype(np.float32) * np.float32(scale)
+        self._before = _Before(state.before, rgb, depth, (rgb, units, scale))
+        if state.before == current:
+            self._upload(state.before, rgb, units, scale)
+            self._set_motion(state.before, motion)
+
+    # -- motion within a frame -----------------------------------------------------------------------------------
+
+    @property
+    def motion(self) -> FrameMotion:
+        """How the camera moved while it took the last frame, as far as is known by now."""
+        return self._motions[max(self._motions)] if self._motions else NO_MOTION
+
+    def _set_motion(self, index: int, motion: FrameMotion) -> None:
+        """How the camera moved while it took a frame whose images are loaded."""
+        self._motions[index] = motion
+        while len(self._motions) > RECENT:
+            del self._motions[min(self._motions)]
+        struct = records(points.Motion)
+        twist = np.array(motion.twist)
+        struct["to_depth"] = motion_of(-motion.depth_offset * twist)
+        struct["velocity"], struct["spin"] = motion.readout * twist[:3], motion.readout * twist[3:]
+        struct["moves"] = not motion.is_none
+        self.registrar.set_motion(self._row_of[index], struct)
+
+    def _foretell_motion(self, frame: AdmittedFrame, history: FrameHistory) -> None:
+        """The camera moves during this frame as it did between the last ones."""
+        motion = FrameMotion(depth_offset=frame.depth_offset, readout=self.readout)
+        self._set_motion(frame.index, motion.with_twist(history.twist()))
+
+    def _ask_motion(self, joint: Any, frame: AdmittedFrame, history: FrameHistory, W: np.ndarray) -> None:
+        """Have the joint registration correct the motion by the pose that it begins with."""
+        earlier = history.earlier(TWIST_STEPS - 1)
+        if (frame.depth_offset == 0.0 and self.readout == 0.0) or earlier is None:
+            return
+        joint["T_earlier_reference"] = inverse(history.pose(earlier)) @ W
+        joint["elapsed"] = max(frame.timestamp - history.timestamp(earlier), 0.0)
+        joint["delay"], joint["readout"] = frame.depth_offset, self.readout
+
+    def _note_motion(self, frame: AdmittedFrame, pose: np.ndarray, history: FrameHistory) -> None:
+        """The motion during a frame that was located, and during the keyframe before it, now seen from both sides."""
+        earlier = history.earlier(TWIST_STEPS - 1)
+        motion = self._motions[frame.index]
+        if (motion.depth_offset == 0.0 and motion.readout == 0.0) or earlier is None:
+            return
+        elapsed = frame.timestamp - history.timestamp(earlier)
+        if elapsed <= 0:
+            return
+        twist = twist_of(inverse(history.pose(earlier)) @ pose) / elapsed
+        self._set_motion(frame.index, motion.with_twist(twist))
+        last = self.keyframes[-1]
+        if earlier != frame.index - TWIST_STEPS:
+            return
+        if len(self.keyframes) == 1 and last.index == earlier and not history.follows(earlier):
+            self._begin_again(frame, twist, history)
+        elif last.index == frame.index - 1:
+            self._correct_keyframe(len(self.keyframes) - 1, twist)
+
+    def _correct_keyframe(self, number: int, twist: np.ndarray) -> None:
+        """Choose a keyframe's points anew for another motion."""
+        keyframe = self.keyframes[number]
+        keyframe.motion = keyframe.motion.with_twist(twist)
+        row = self._row(keyframe)
+        self._set_motion(keyframe.index, keyframe.motion)
+        self.registrar.select(row, self._points_of(number))
+
+    def _begin_again(self, frame: AdmittedFrame, twist: np.ndarray, history: FrameHistory) -> None:
+        """The first keyframe gets its motion from the two frames after it, and these are registered once more."""
+        self._correct_keyframe(0, twist)
+        W = self.keyframes[0].pose
+        for index in range(self.keyframes[0].index + 1, frame.index + 1):
+            anchor = self._anchors[index]
+            if index not in self._row_of or index not in self._motions or anchor is None or anchor.keyframe != 0:
+                continue
+            self._set_motion(index, self._motions[index].with_twist(twist))
+            task = self._task()
+            task["keyframe"], task["row"], task["top"] = self._points_of(0), self._row_of[index], self.judged
+            task["T"] = inverse(anchor.T_keyframe_frame)
+            result = self.registrar.register(task)[0]
+            if result["ok"]:
+                T = orthonormalized(inverse(np.asarray(result["T"], np.float64)))
+                self._anchors[index] = _Anchor(0, T)
+                if index < len(history):
+                    history.correct(index, W @ T)
+
+
+def _better(a: Attempt | None, b: Attempt | None, *, by_cost: bool = False) -> Attempt | None:
+    if a is None or b is None:
+        return a if b is None else b
+    if by_cost:
+        return b if b.cost < a.cost else a
+    return b if b.measures.worth > a.measures.worth else a
+
+
+def _why_lost(best: Attempt | None) -> str:
+    if best is None:
+        return "no registration to a keyframe came to an end"
+    m = best.measures
+    return (
+        f"{m.agreement:.0%} of the depth agrees with the best keyframe, grey values correlate by {m.correlation:.2f}, "
+        f"{m.view:.0%} of it is in view"
+    )
+
+
+def rotation_grid(span: float) -> np.ndarray:
+    """Rotations (n, 3, 3): pitch and yaw every 3 degrees up to ``span``, roll -8, 0 and 8 degrees."""
+    angles = np.radians(np.arange(-span, span + 0.1, 3.0))
+    return np.array(
+        [
+            motion_of(np.array([0.0, 0.0, 0.0, pitch, yaw, roll]))[:3, :3]
+            for roll in np.radians([-8.0, 0.0, 8.0])
+            for pitch in angles
+            for yaw in angles
+        ]
+    )

@@ -1,0 +1,90 @@
+"""Keyframes refined together: direct registration of every overlapping pair, over all poses at once.
+
+With T = W_j^-1 W_i and xi = Ad(T) d_i - d_j for motions W <- W exp(d), a pair adds Ad^T H Ad, H and -Ad^T H after its
+gain and bias are eliminated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from warpslam.kernels.direct import registration
+from warpslam.poses import adjoint, inverse, motion_of, orthonormalized
+from warpslam.tracking.direct.pyramid import records
+from warpslam.tracking.direct.registrar import Registrar
+
+MIN_OVERLAP = 0.3
+"""Of a pair."""
+MAX_STEP = 0.05
+"""Of a pose in one iteration [m, rad]."""
+FIXED = 1e12
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A keyframe of the window."""
+
+    points: int
+    """Row of its points."""
+    row: int
+    """Of its images."""
+    T_world_camera: np.ndarray
+
+
+def refine_window(
+    registrar: Registrar, members: Sequence[Pose], level: int, grey: float, depth: float, iterations: int
+) -> list[np.ndarray]:
+    """Poses (4, 4) of the members after refinement; the first stays where it is."""
+    poses = [member.T_world_camera.copy() for member in members]
+    pairs = _overlapping(registrar, members)
+    if not pairs:
+        return poses
+    asked = records(registration.Pair, len(pairs))
+    asked["exposure"] = (1.0, 0.0)
+    asked["keyframe"], asked["row"] = zip(*((members[i].points, members[j].row) for i, j in pairs), strict=True)
+    count = len(members)
+    for _ in range(iterations):
+        transforms = [inverse(poses[j]) @ poses[i] for i, j in pairs]
+        asked["T"] = transforms
+        sums = registrar.pairs(level, asked, grey, depth)
+        A, b = np.zeros((count, 6, count, 6)), np.zeros((count, 6))
+        for (i, j), T, pair, found in zip(pairs, transforms, asked, sums, strict=True):
+            H, g = np.asarray(found["H"], np.float64), np.asarray(found["g"], np.float64)
+            H, g = np.where(np.isfinite(H), H, 0.0), np.where(np.isfinite(g), g, 0.0)
+            gain, bias = (float(value) for value in pair["exposure"])
+            own = H[6:, 6:] + np.diag([100.0, 1e-3])
+            rest = g[6:] + np.array([100.0 * (gain - 1.0), 0.0])
+            left = H[:6, 6:] @ np.linalg.inv(own)
+            h, q = H[:6, :6] - left @ H[6:, :6], g[:6] - left @ rest
+            step = np.linalg.solve(own, rest)
+            pair["exposure"] = np.clip(gain - step[0], 0.3, 3.0), bias - step[1]
+            pair["scales"] = found["scales"]
+            Ad = adjoint(T)
+            A[i, :, i] += Ad.T @ h @ Ad
+            A[j, :, j] += h
+            A[i, :, j] -= Ad.T @ h
+            A[j, :, i] -= h @ Ad
+            b[i] += Ad.T @ q
+            b[j] -= q
+        M = A.reshape(6 * count, 6 * count)
+        M[np.diag_indices_from(M)] = 1.001 * M.diagonal() + 1.0
+        M[range(6), range(6)] += FIXED
+        steps = -np.linalg.solve(M, b.reshape(-1)).reshape(count, 6)
+        for k in range(1, count):
+            poses[k] = orthonormalized(poses[k] @ motion_of(np.clip(steps[k], -MAX_STEP, MAX_STEP)))
+    return poses
+
+
+def _overlapping(registrar: Registrar, members: Sequence[Pose]) -> list[tuple[int, int]]:
+    """Pairs (i, j) where j sees enough of what i has points on."""
+    pairs = []
+    poses = np.array([member.T_world_camera for member in members])
+    for j, member in enumerate(members):
+        others = [i for i in range(len(members)) if i != j]
+        transforms = inverse(member.T_world_camera) @ poses[others]
+        shares = registrar.overlap(member.row, [members[i].points for i in others], transforms)
+        pairs += [(i, j) for i, share in zip(others, shares, strict=True) if share > MIN_OVERLAP]
+    return sorted(pairs)
