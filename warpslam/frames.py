@@ -58,6 +58,10 @@ class FrameResult:
     """Share of the depth rays into what the map has seen that agree with it, in [0, 1]."""
     depth_error: float = 0.0
     """Mean ``|measured - rendered depth|`` of the inliers [m]."""
+    correlation: float | None = None
+    """Of grey values with the keyframe that the frame was registered to, in [-1, 1]; None with other tracking."""
+    covariance: np.ndarray | None = None
+    """Of the pose, float64 (6, 6): T_world_camera is uncertain by exp(xi) on its right, xi = (v, w) [m, rad]."""
     timings: dict[str, float] = field(default_factory=dict)
     """Seconds by phase: "tracking", "mapping" (overlapped: waiting for it and taking it over), "keyframe"."""
     message: str = ""
