@@ -232,7 +232,13 @@ def _image(fields: StateFields, n: int, scale: float, camera: Intrinsics) -> Com
 def _direct_header(state: DirectState) -> dict[str, Any]:
     # JSON knows no infinity.
     scale, cost = (value if np.isfinite(value) else None for value in state.typical)
-    return {"reference": state.reference, "before": state.before, "confirmed": state.confirmed, "scale": scale, "cost": cost}
+    return {
+        "reference": state.reference,
+        "before": state.before,
+        "confirmed": state.confirmed,
+        "scale": scale,
+        "cost": cost,
+    }
 
 
 def _direct(fields: StateFields, frames: int, keyframes: int) -> DirectState | None:

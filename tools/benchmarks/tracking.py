@@ -47,7 +47,13 @@ class Tracker(Protocol):
     """What of `Slam` is used here."""
 
     def step(
-        self, rgb: Any, depth: Any, timestamp: float | None = None, T_world_camera: np.ndarray | None = None
+        self,
+        rgb: Any,
+        depth: Any,
+        timestamp: float | None = None,
+        T_world_camera: np.ndarray | None = None,
+        *,
+        depth_timestamp: float | None = None,
     ) -> FrameResult:
         """Take in one frame."""
 

@@ -53,6 +53,8 @@ CONFIRMATIONS = 3
 """Frames that must follow before a place found again is believed."""
 UNIQUE = 1.5
 """Another place that costs less than this multiple of the best is as likely."""
+DECISIVE = 0.7
+"""Another pose than the one foretold must cost less than this multiple of what that one costs."""
 NEAR_SHIFT = 2.0
 """What moves less against what was foretold [px of the middle level] need not look as much alike."""
 SHIFT_PRICE = 0.02
@@ -386,7 +388,11 @@ class DirectTracker:
         level = self.plan.middle
         self.registrar.select(row, SCRATCH, level)
         pair = records(registration.Pair)
-        pair["keyframe"], pair["row"], pair["T"] = SCRATCH, self._row(self.keyframes[keyframe]), inverse(T_frame_keyframe)
+        pair["keyframe"], pair["row"], pair["T"] = (
+            SCRATCH,
+            self._row(self.keyframes[keyframe]),
+            inverse(T_frame_keyframe),
+        )
         pair["exposure"] = (1.0, 0.0)
         found = self.registrar.pairs(level, pair, self.config.grey_weight, self.config.depth_weight)[0]
         return Measures.of(found["counts"])
@@ -446,7 +452,11 @@ class DirectTracker:
         """At the reference, at the frame before, at older keyframes, until a pose is believed."""
         if history.last_known is not None or self._found is not None:
             poses = [*starts, *self._turned(row, starts)]
-            best = _better(best, self._search(row, self._reference, poses, starts[0], best), by_cost=True)
+            found = self._search(row, self._reference, poses, starts[0], None)
+            if best is None or not self._is_good(best) or best.moved > NEAR_SHIFT:
+                best = _better(best, found, by_cost=True)
+            elif found is not None and self._is_good(found) and found.cost < DECISIVE * best.cost:
+                best = found
             if best is not None and self._is_good(best):
                 return best
             before = self._before
