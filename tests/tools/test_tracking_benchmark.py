@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tools.benchmarks import tracking
 from tools.benchmarks.tracking import Drive, Figures, drive, false_ok, judge, open_named, table
-from warpslam.camera import Intrinsics
+from warpslam.camera import ONE_MOMENT, Intrinsics
 from warpslam.errors import WarpSlamError
 from warpslam.frames import FrameResult, FrameStatus
 from warpslam.synthetic import SyntheticSequence, write_replica
@@ -35,10 +35,12 @@ class Told:
     def __init__(self, poses: np.ndarray, status: list[FrameStatus], final: np.ndarray) -> None:
         self.poses, self.status, self.final = poses, status, final
         self.given: list[np.ndarray | None] = []
+        self.depth_times: list[float | None] = []
         self.finished = False
 
-    def step(self, rgb, depth, timestamp=None, T_world_camera=None):
+    def step(self, rgb, depth, timestamp=None, T_world_camera=None, *, depth_timestamp=None):
         number = len(self.given)
+        self.depth_times.append(depth_timestamp)
         self.given.append(T_world_camera)
         return FrameResult(number, timestamp, self.poses[number], self.status[number])
 
@@ -150,7 +152,8 @@ def test_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(tracking, "CAMERA", SMALL)
     asked = []
 
-    def make(intrinsics, config, device, seed):
+    def make(intrinsics, config, device, seed, *, timing):
+        assert timing == ONE_MOMENT  # as of all that is rendered
         asked.append(config)
         truth = open_named("cabinet@0:5", tmp_path).ground_truth()
         return Told(truth, [OK, OK, OK, LOST, OK], truth)
