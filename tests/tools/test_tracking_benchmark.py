@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -115,12 +116,19 @@ def test_figures():
 
 def test_drive_gives_the_first_pose_only():
     """Each frame is stepped once, in order; poses and status come back, the final ones after the end."""
-    sequence = SyntheticSequence(0, 4, intrinsics=SMALL, device="cpu")
+
+    class Stamped(SyntheticSequence):
+        def __getitem__(self, index):
+            frame = super().__getitem__(index)
+            return replace(frame, depth_timestamp=frame.timestamp - 0.01)
+
+    sequence = Stamped(0, 4, intrinsics=SMALL, device="cpu")
     truth = sequence.ground_truth()
     slam = Told(truth, [OK, OK, LOST, OK], truth + 1.0)
     driven = drive(slam, sequence)
     np.testing.assert_array_equal(slam.given[0], truth[0])
     assert slam.given[1:] == [None] * 3
+    np.testing.assert_allclose(slam.depth_times, np.arange(4) / 30 - 0.01)
     np.testing.assert_array_equal(driven.online, truth)
     np.testing.assert_array_equal(driven.final, truth + 1.0)
     assert driven.status == ["OK", "OK", "LOST", "OK"] and len(driven.cpu_seconds) == 4
