@@ -501,9 +501,9 @@ class Slam:
         slam._seen = list(state.seen)
         slam._current, slam._mapped = state.current, state.mapped
         if slam.direct is not None:
-            slam.direct = slam._direct_tracker()
-            if state.direct is not None:
-                slam.direct.restore(state.direct, state.current, state.current_motion)
+            slam.direct = direct = slam._direct_tracker()
+            if direct is not None and state.direct is not None:
+                direct.restore(state.direct, state.current, state.current_motion)
         return slam
 
 

@@ -51,8 +51,10 @@ def run(frames: int, *overrides: str, seed: int = 0) -> Imap:
 
 @pytest.fixture(scope="module")
 def trained() -> Imap:
-    """One frame, well learnt."""
-    return run(1, "imap.first_iterations=200")
+    """One frame, well learnt, with two slices on any machine."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("warpslam.runtime.cores._core_count", lambda: 2)
+        return run(1, "imap.first_iterations=200")
 
 
 def test_it_learns_a_frame(trained):

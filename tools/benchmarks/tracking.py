@@ -98,7 +98,13 @@ def drive(slam: Tracker, sequence: RgbdSequence) -> Drive:
     for index in range(len(sequence)):
         frame = sequence[index]
         start, used = time.perf_counter(), time.process_time()
-        result = slam.step(frame.rgb, frame.depth, frame.timestamp, frame.T_world_camera if index == 0 else None)
+        result = slam.step(
+            frame.rgb,
+            frame.depth,
+            frame.timestamp,
+            frame.T_world_camera if index == 0 else None,
+            depth_timestamp=frame.depth_timestamp,
+        )
         cpu.append(time.process_time() - used)
         wall += time.perf_counter() - start
         online.append(result.T_world_camera)
@@ -206,7 +212,7 @@ def measure(text: str, options: argparse.Namespace) -> Figures:
     if options.optimizer:
         overrides.append(f"tracking.optimizer={options.optimizer}")
     config = Config.from_preset(options.preset or sequence.preset, overrides)
-    slam = Slam(sequence.intrinsics, config, options.device, options.seed)
+    slam = Slam(sequence.intrinsics, config, options.device, options.seed, timing=sequence.timing)
     return judge(drive(slam, sequence), truth)
 
 

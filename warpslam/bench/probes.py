@@ -18,7 +18,7 @@ from warpslam.field.rendering import render_image
 from warpslam.frames import FrameStatus, read_images
 from warpslam.mapping.frustum import measured_extent, select_in_frustum
 from warpslam.mapping.mapper import Mapper
-from warpslam.pipeline.setup import load_kernels, open_source, select_frames
+from warpslam.pipeline.setup import as_configured, load_kernels, open_source, select_frames
 from warpslam.poses import orthonormalized
 from warpslam.runs.given_poses import GivenPoses
 from warpslam.scene.feature_grid import FeatureGrid
@@ -159,6 +159,7 @@ def _open(job: Job) -> tuple[RgbdSequence, Config, Iterator[tuple[Frame, np.ndar
     sequence = open_source(request.source)
     # Poses are used here, not given to tracking: what the settings say of it stays as it is.
     config = replace(request, poses=None).settings(sequence.preset)
+    sequence = as_configured(sequence, config)
     load_kernels(sequence, request.device)
     given = None if request.poses is None else GivenPoses.read(request.poses)
 

@@ -12,7 +12,7 @@ from warpslam.cli.common import add_command, add_sequence_options, add_slam_opti
 from warpslam.config import Config
 from warpslam.errors import ConfigError, MeshError
 from warpslam.pipeline.finished import open_source
-from warpslam.pipeline.setup import build_slam, load_kernels, select_frames
+from warpslam.pipeline.setup import as_configured, build_slam, load_kernels, select_frames
 from warpslam.profiling.session import Profile
 from warpslam.runs.request import Source
 from warpslam.runtime.phases import phase
@@ -67,7 +67,8 @@ def _input(options: argparse.Namespace) -> tuple[RgbdSequence, Config]:
         return open_source(Source.demo()), Config.from_preset(preset, overrides)
     source = Source(str(Path(options.folder).expanduser().resolve()), options.dataset, options.camera)
     sequence = open_source(source)
-    return sequence, Config.from_preset(options.preset or sequence.preset, options.overrides)
+    config = Config.from_preset(options.preset or sequence.preset, options.overrides)
+    return as_configured(sequence, config), config
 
 
 def _run(sequence: RgbdSequence, config: Config, selected: range, options: argparse.Namespace) -> Profile:

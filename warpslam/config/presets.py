@@ -22,6 +22,7 @@ def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, A
         "keyframes": {"every": 50},
         "meshing": {"level_set": 0.0},
         "sensor_timing": False,
+        "published_images": True,
         **groups,
     }
 
@@ -52,6 +53,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     ),
     "paper_imap": {
         "sensor_timing": False,
+        "published_images": True,
         "sampling": {"jitter": False},
         "keyframes": {"every": 50},
         "tracking": {"final_rate_factor": 1.0},

@@ -301,6 +301,9 @@ class Config(_Group):
         description="strict: mapping after tracking, runs repeat to the bit; overlapped: beside it, and the map is at "
         "most one mapping interval behind",
     )
+    published_images: bool = Field(
+        False, description="frames are resized and cropped as in the paper's code, where a dataset's camera says how"
+    )
     sensor_timing: bool = Field(
         True,
         description="depth that is taken before or after colour, and rows that are taken one after the other, are "

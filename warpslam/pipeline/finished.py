@@ -18,7 +18,7 @@ from warpslam.evaluation import (
     trajectory_metrics,
 )
 from warpslam.pipeline.results import render_panel
-from warpslam.pipeline.setup import load_slam, open_source
+from warpslam.pipeline.setup import as_configured, load_slam, open_source
 from warpslam.runs.folder import RunFolder
 from warpslam.spread import spread
 from warpslam.storage.json_files import read_json
@@ -72,7 +72,8 @@ def evaluate_run(
         # What counts is decided at true poses, as in the run: a wrong trajectory must not choose what it is judged by.
         known = np.where(paired[:, None, None], truth_poses[partner], poses)
         mesh = folder.require(folder.mesh, "see metrics.json for why the run made none")
-        sequence, indices = open_source(folder.read_source()), _frame_indices(folder, len(times))
+        sequence = as_configured(open_source(folder.read_source()), folder.read_config())
+        indices = _frame_indices(folder, len(times))
         results = evaluate_mesh(
             mesh, load_mesh(truth_mesh), sequence, indices, known, protocols=protocols, device=device
         )
@@ -86,7 +87,8 @@ def evaluate_run(
 
 
 def _rendering_metrics(folder: RunFolder, poses: np.ndarray, count: int, device: str | None) -> dict[str, Any]:
-    slam, sequence = load_slam(folder, device), open_source(folder.read_source())
+    slam = load_slam(folder, device)
+    sequence = as_configured(open_source(folder.read_source()), folder.read_config())
     indices = _frame_indices(folder, len(poses))
     chosen = spread(len(poses), count)
     return rendering_metrics([render_panel(slam, sequence[indices[n]], poses[n]) for n in chosen])
@@ -115,7 +117,9 @@ def render_frame(folder: RunFolder, index: int, output: str | Path | None = None
     if index not in used:
         raise InputError(f"frame {index} was not used by the run {folder.path}, so it has no pose; choose another one")
     path = Path(output) if output is not None else folder.path / f"render_{index:06d}.png"
-    plot_panels(path, [render_panel(load_slam(folder, device), sequence[index], poses[used.index(index)])])
+    slam = load_slam(folder, device)
+    frame = as_configured(sequence, folder.read_config())[index]
+    plot_panels(path, [render_panel(slam, frame, poses[used.index(index)])])
     return path
 
 

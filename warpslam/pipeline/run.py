@@ -29,7 +29,15 @@ from warpslam.pipeline.results import (
     write_map,
     write_trajectory,
 )
-from warpslam.pipeline.setup import build_slam, load_kernels, open_map, open_source, resolve, true_surface
+from warpslam.pipeline.setup import (
+    as_configured,
+    build_slam,
+    load_kernels,
+    open_map,
+    open_source,
+    resolve,
+    true_surface,
+)
 from warpslam.report import write_report
 from warpslam.runs.folder import RunFolder
 from warpslam.runs.given_poses import GivenPoses
@@ -88,6 +96,7 @@ def run(
             raise ConfigError("the request has no source: name one, or hand over a sequence")
         sequence = open_source(request.source)
     request = resolve(request, sequence)
+    sequence = as_configured(sequence, request.config)
     truth_mesh = true_surface(request, sequence) if truth_mesh is None else truth_mesh
     observer.begin(sequence.name)
     why_anew = ""

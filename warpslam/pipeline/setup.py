@@ -41,6 +41,11 @@ def open_source(source: Source) -> RgbdSequence:
     return open_sequence(source.path or "", dataset=source.dataset, camera=source.camera)
 
 
+def as_configured(sequence: RgbdSequence, config: Config | None) -> RgbdSequence:
+    """The sequence with frames of the kind that settings ask for."""
+    return sequence.as_published() if config is not None and config.published_images else sequence
+
+
 def true_surface(request: RunRequest, sequence: RgbdSequence) -> trimesh.Trimesh | None:
     """The surface that a reconstruction is compared with: that of the request, or the built-in sequence's own.
 

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from datetime import datetime
 from pathlib import Path
 
+from warpslam.config import Config
 from warpslam.errors import ConfigError, DatasetError
 from warpslam.runs.request import Source
 from warpslam.storage.json_files import read_json, write_json
@@ -150,6 +151,15 @@ class RunFolder:
             return Source.from_dict(fields)
         except TypeError as error:
             raise DatasetError(f"{self.source}: expected path, dataset, camera and command ({error})") from error
+
+    def read_config(self) -> Config:
+        """Settings of the run.
+
+        Raises:
+            DatasetError: The run did not record them.
+            ConfigError: The file is damaged.
+        """
+        return Config.load(self.require(self.config, "so its settings are unknown"))
 
 
 def as_file_name(name: str) -> str:

@@ -53,6 +53,10 @@ class RgbdSequence(ABC):
         for index in range(len(self)):
             yield self[index]
 
+    def as_published(self) -> RgbdSequence:
+        """The sequence with frames as the paper's code takes them; itself where that makes no difference."""
+        return self
+
     def ground_truth(self) -> np.ndarray | None:
         """All ground-truth poses, float64, shape (N, 4, 4), NaN-filled where one is unknown; None if there are none."""
         return None

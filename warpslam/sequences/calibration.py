@@ -14,7 +14,9 @@ from warpslam.errors import ConfigError, DatasetError
 CAMERA_FIELDS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale")
 CAMERA_FILE = "camera.yaml"
 _MAX_SIZE = 16384  # [pixels], what OpenCV warps without trouble
-_OPTIONAL_FIELDS = ("distortion", "resize", "crop", "depth_delay", "readout")
+_OPTIONAL_FIELDS = (
+    "distortion", "depth_distorted", "resize", "crop", "published_resize", "published_crop", "depth_delay", "readout"
+)  # fmt: skip
 _DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 
 
@@ -32,6 +34,12 @@ class Calibration:
     """Size (width, height) to which frames are resized first; None = as stored."""
     crop: int = 0
     """Border [pixels] cut from every side after resizing."""
+    depth_distorted: bool = False
+    """Whether depth lies in the pixels of the distorted colour image, so that it is undistorted, too."""
+    published_resize: tuple[int, int] | None = None
+    """Size to which the paper's code resizes the frames; None = as ``resize``."""
+    published_crop: int | None = None
+    """Border that the paper's code then cuts; None = as ``crop``."""
     stored_timing: SensorTiming = ONE_MOMENT
     """When the pixels of the stored images are taken."""
     source: str = "camera"
@@ -49,6 +57,15 @@ class Calibration:
         rows = self.intrinsics.height
         return replace(self.stored_timing, readout=self.stored_timing.readout * rows / (rows + 2 * self.crop))
 
+    def as_published(self) -> Calibration:
+        """With frames resized and cropped as in the paper's code, and depth left as it is stored."""
+        return replace(
+            self,
+            resize=self.published_resize or self.resize,
+            crop=self.crop if self.published_crop is None else self.published_crop,
+            depth_distorted=False,
+        )
+
     def to_yaml(self) -> str:
         """The text of a ``camera.yaml`` that `from_yaml` reads back; fields at their defaults are left out."""
         import yaml
@@ -60,6 +77,8 @@ class Calibration:
             fields["resize"] = list(self.resize)
         if self.crop:
             fields["crop"] = self.crop
+        if self.depth_distorted:
+            fields["depth_distorted"] = True
         fields |= {name: value for name, value in asdict(self.stored_timing).items() if value}
         return yaml.safe_dump(fields, sort_keys=False, default_flow_style=None)
 
@@ -87,14 +106,7 @@ class Calibration:
             raise DatasetError(
                 f"{source}: width x height = {width} x {height} must be at most {_MAX_SIZE} pixels each; correct it"
             )
-        resize = fields.get("resize")
-        if resize is not None:
-            pair = _numbers(resize, "resize", source)
-            if len(pair) != 2 or min(pair) < 1 or max(pair) > _MAX_SIZE:
-                raise DatasetError(
-                    f"{source}: resize = {resize!r} must be [width, height] in pixels, 1 to {_MAX_SIZE} each"
-                )
-            resize = (_whole(pair[0], "resize", source), _whole(pair[1], "resize", source))
+        resize = _size(fields, "resize", source)
         distortion = _numbers(fields.get("distortion") or (), "distortion", source)
         if len(distortion) not in _DISTORTION_LENGTHS:
             raise DatasetError(
@@ -103,10 +115,27 @@ class Calibration:
         crop = _whole(_number(fields.get("crop") or 0, "crop", source), "crop", source)
         if crop < 0:
             raise DatasetError(f"{source}: crop = {crop} must be 0 or more pixels")
+        depth_distorted = fields.get("depth_distorted", False)
+        if not isinstance(depth_distorted, bool):
+            raise DatasetError(f"{source}: depth_distorted = {depth_distorted!r} must be true or false")
+        published_crop = fields.get("published_crop")
+        if published_crop is not None:
+            published_crop = _whole(_number(published_crop, "published_crop", source), "published_crop", source)
         seconds = {name: _number(fields.get(name) or 0.0, name, source) for name in ("depth_delay", "readout")}
         try:
             stored = Intrinsics(**values, width=width, height=height)
-            calibration = cls(stored, depth_scale, distortion, resize, crop, SensorTiming(**seconds), source)
+            calibration = cls(
+                stored,
+                depth_scale,
+                distortion,
+                resize,
+                crop,
+                depth_distorted=depth_distorted,
+                published_resize=_size(fields, "published_resize", source),
+                published_crop=published_crop,
+                stored_timing=SensorTiming(**seconds),
+                source=source,
+            )
             # A crop larger than the image shows here.
             _ = calibration.intrinsics
         except ConfigError as error:
@@ -198,3 +227,14 @@ def _whole(value: float, name: str, source: str) -> int:
     if value != int(value):
         raise DatasetError(f"{source}: {name} = {value:g} must be a whole number of pixels")
     return int(value)
+
+
+def _size(fields: dict[str, Any], name: str, source: str) -> tuple[int, int] | None:
+    """Width and height [pixels] in a field; None where it is missing."""
+    size = fields.get(name)
+    if size is None:
+        return None
+    pair = _numbers(size, name, source)
+    if len(pair) != 2 or min(pair) < 1 or max(pair) > _MAX_SIZE:
+        raise DatasetError(f"{source}: {name} = {size!r} must be [width, height] in pixels, 1 to {_MAX_SIZE} each")
+    return _whole(pair[0], name, source), _whole(pair[1], name, source)

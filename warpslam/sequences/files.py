@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import operator
 import re
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ _FIRST_FRAMES = 10
 
 
 class FileSequence(RgbdSequence):
-    """RGB-D files on disk. Colour is undistorted, then colour and depth are resized and cropped.
+    """RGB-D files on disk. Colour (and depth, if it is distorted alike) is undistorted, then both are resized, cropped.
 
     Args:
         folder: Folder of the sequence; gives it its name.
@@ -72,6 +73,13 @@ class FileSequence(RgbdSequence):
         self._color_size_may_differ = color_size_may_differ
         self.remarks = tuple(remarks)
         self._check_first_frames()
+
+    def as_published(self) -> FileSequence:
+        """The sequence with frames resized and cropped as the paper's code does it, depth left as it is stored."""
+        published = copy.copy(self)
+        published.calibration = self.calibration.as_published()
+        published.intrinsics, published.timing = published.calibration.intrinsics, published.calibration.timing
+        return published
 
     def __len__(self) -> int:
         return len(self._rgb_files)
@@ -126,6 +134,8 @@ class FileSequence(RgbdSequence):
             import cv2
 
             rgb = cv2.remap(rgb, *self._undistortion, interpolation=cv2.INTER_LINEAR)
+            if self.calibration.depth_distorted:
+                depth = cv2.remap(depth, *self._undistortion, interpolation=cv2.INTER_NEAREST)
         if self.calibration.resize is not None:
             rgb, depth = _resize(rgb, depth, *self.calibration.resize)
         border = self.calibration.crop

@@ -1,23 +1,24 @@
 """Residuals of a keyframe's points in another frame, and their normal equations.
 
-T takes points from the keyframe's axes to those of the frame, T <- exp(xi) T with xi = (v, w); a and b are gain and bias
-of the pair's exposure.
+T takes points from the keyframe's axes to those of the frame, T <- exp(xi) T with xi = (v, w); a and b are gain and
+bias of the pair's exposure.
 
     photometric  r = I(pi(T X)) - (a I_k + b)
                  J = [j, (T X) x j, -I_k, -1],   j = (gx fx/z, gy fy/z, -(gx fx x + gy fy y)/z^2)
     geometric    r = (R n) . (P - T X) / s(z),   P = the frame's depth on the ray of T X
                  J = [-n, -(P x n)] / s,         s(z) = 0.0012 + 0.0019 (z - 0.4)^2  [m]
 
-Both are weighted as residuals of a t-distribution with five degrees of freedom, w = 6 / (5 + (r/S)^2) / S^2, each kind by
-its own scale S: 1.4826 times the median of |r| as it was at the last evaluation. Where the camera moved while it took
-the image, the geometric residual uses G = V^-1 T in place of T, and both shift by the row (`warpslam.kernels.direct.points`).
+Both are weighted as residuals of a t-distribution with five degrees of freedom, w = 6 / (5 + (r/S)^2) / S^2, each kind
+by its own scale S: 1.4826 times the median of |r| as it was at the last evaluation. Where the camera moved while it
+took the image, the geometric residual uses G = V^-1 T in place of T, and both shift by the row
+(`warpslam.kernels.direct.points`).
 
 A group of ``lanes`` threads sums over the points and has the same result in each: a warp of CUDA, or one thread.
 """
 
 import warp as wp
 
-from warpslam.kernels.direct.images import MODULE, Images, Level
+from warpslam.kernels.direct.images import Images, Level
 from warpslam.kernels.direct.points import MIN_DEPTH, Motion, Points, bilinear, inside, rolled
 
 Mat66 = wp.types.matrix(shape=(6, 6), dtype=wp.float32)
@@ -219,24 +220,24 @@ def evaluate(
                     wp.atomic_add(bins, _BINS + wp.min(int(wp.abs(r) / _DEPTH_BIN), _BINS - 1), 1)
         if weights.grey > 0.0 and not hidden:
             shade = bilinear(images, row, level, u, v)
-            I = points.grey[keyframe, k]
-            r = shade[0] - exposure[0] * I - exposure[1]
+            key = points.grey[keyframe, k]
+            r = shade[0] - exposure[0] * key - exposure[1]
             ratio = r / weights.grey_scale
             jx = shade[1] * level.fx / p[2]
             jy = shade[2] * level.fy / p[2]
             j = wp.vec3(jx, jy, -(jx * p[0] + jy * p[1]) / p[2])
             turn = wp.cross(p, j)
-            J = Vec8(j[0], j[1], j[2], turn[0], turn[1], turn[2], -I, -1.0)
+            J = Vec8(j[0], j[1], j[2], turn[0], turn[1], turn[2], -key, -1.0)
             w = weights.grey * student(ratio) / (weights.grey_scale * weights.grey_scale)
             H += wp.outer(w * J, J)
             g += (w * r) * J
             counts[_GREY_COUNT] += 1.0
             counts[_COST] += weights.grey * student_cost(ratio)
             counts[8] += shade[0]
-            counts[9] += I
+            counts[9] += key
             counts[10] += shade[0] * shade[0]
-            counts[11] += I * I
-            counts[12] += shade[0] * I
+            counts[11] += key * key
+            counts[12] += shade[0] * key
             wp.atomic_add(bins, wp.min(int(wp.abs(r) / _GREY_BIN), _BINS - 1), 1)
     group_wait()
     sums = Sums()
@@ -353,7 +354,7 @@ def inverted(T: wp.mat44) -> wp.mat44:
 
 @wp.func
 def rectified(T: wp.mat44) -> wp.mat44:
-    """The rigid transform next to one whose rotation is nearly one: two steps of Newton's iteration for the polar factor.
+    """The rigid transform next to one whose rotation is nearly one, by two steps of Newton's iteration.
 
     Without it errors would grow with every product.
     """

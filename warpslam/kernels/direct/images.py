@@ -1,8 +1,8 @@
 """Pyramids of grey values, their gradients, and depth.
 
-The levels of a frame lie one after the other in a row of each array, each from its first row on; level 0 is the largest.
-Depth is halved by the mean of what lies within 3 % of the nearest of the four, so that nothing mixes across outlines and
-holes of one pixel close.
+The levels of a frame lie one after the other in a row of each array, each from its first row on; level 0 is the
+largest. Depth is halved by the mean of what lies within 3 % of the nearest of the four, so that nothing mixes across
+outlines and holes of one pixel close.
 """
 
 import warp as wp

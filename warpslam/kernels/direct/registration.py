@@ -17,8 +17,6 @@ from warpslam.kernels.direct.equations import (
     POINTS,
     Mat66,
     Mat88,
-    Sums,
-    Vec6,
     Vec8,
     Vec16,
     Weights,

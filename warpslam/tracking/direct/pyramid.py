@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -38,7 +39,7 @@ class PyramidPlan:
         count = 1
         while count < MAX_LEVELS and _fits(camera, edge << count):
             count += 1
-        levels = np.zeros(count, Level.numpy_dtype())
+        levels = records(Level, count)
         pixel = point = 0
         width, height = camera.width // edge, camera.height // edge
         for n, level in enumerate(levels):
@@ -87,3 +88,8 @@ class PyramidPlan:
 
 def _fits(camera: Intrinsics, edge: int) -> bool:
     return camera.width // edge >= MIN_WIDTH and camera.height // edge >= MIN_HEIGHT
+
+
+def records(struct: Any, count: int = 1) -> Any:
+    """A structured array of zeros for a struct of Warp, (count,)."""
+    return np.zeros(count, struct.numpy_dtype())

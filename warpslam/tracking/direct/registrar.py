@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from warpslam.kernels.direct import equations, images, points, registration
 from warpslam.runtime.launching import Launcher, Step
-from warpslam.tracking.direct.pyramid import PyramidPlan
+from warpslam.tracking.direct.pyramid import PyramidPlan, records
 
 FIRST_KEYFRAMES = 16
 """Rows of points to begin with; they double as keyframes come."""
@@ -56,7 +57,7 @@ class Registrar:
         self._images.shades = wp.zeros(shape, dtype=wp.vec3, device=device)
         self._images.depth = wp.zeros(shape, dtype=float, device=device)
         self._points = self._new_points(FIRST_KEYFRAMES)
-        still = np.zeros(rows, points.Motion.numpy_dtype())
+        still = records(points.Motion, rows)
         still["to_depth"] = np.eye(4)
         self._motions = wp.array(still, dtype=points.Motion, device=device)
         self._buffers: dict[str, wp.array] = {}
@@ -86,7 +87,7 @@ class Registrar:
     def set_motion(self, row: int, motion: np.ndarray | None) -> None:
         """How the camera moved while it took the image: a `points.Motion`; None = it stood still."""
         if motion is None:
-            motion = np.zeros(1, points.Motion.numpy_dtype())
+            motion = records(points.Motion)
             motion["to_depth"] = np.eye(4)
         self._motions[row : row + 1].assign(motion.reshape(1))
 
@@ -210,7 +211,7 @@ class Registrar:
         if not len(keyframes):
             return np.zeros(0)
         still = self._array("identity", registration.Result, 1)
-        identity = np.zeros(1, registration.Result.numpy_dtype())
+        identity = records(registration.Result)
         identity["T"] = np.eye(4)
         still.assign(identity)
         return np.asarray(self.overlaps(row, still, keyframes, T_frame_keyframe).numpy()[: len(keyframes)])
@@ -298,8 +299,8 @@ OVERLAP_STRIDE = 2
 """Every second point tells enough of an overlap."""
 
 
-def new_tasks(count: int) -> np.ndarray:
+def new_tasks(count: int) -> Any:
     """Tasks with a start at the identity, even exposure, and no cost asked for."""
-    tasks = np.zeros(count, registration.Task.numpy_dtype())
+    tasks = records(registration.Task, count)
     tasks["T"], tasks["exposure"], tasks["cost_level"] = np.eye(4), (1.0, 0.0), -1
     return tasks

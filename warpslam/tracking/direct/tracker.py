@@ -1,9 +1,9 @@
 """The camera by direct registration against keyframes: which starts, which keyframes, and when a pose is believed.
 
 A frame is registered to the reference keyframe from where constant speed foretells it. If the outcome is beyond doubt,
-that is all; if not, the exhaustive search goes over rotations of the smallest images, over the motions that depth leaves
-open and over zero motion, then to the frame before, then to older keyframes. An accepted pose is registered to the
-keyframes of largest overlap at once. A frame that sees much else becomes a keyframe, and the keyframes around it are
+that is all; if not, the exhaustive search goes over rotations of the smallest images, over the motions that depth
+leaves open and over zero motion, then to the frame before, then to older keyframes. An accepted pose is registered to
+the keyframes of largest overlap at once. A frame that sees much else becomes a keyframe, and those around it are
 refined together (`warpslam.tracking.direct.window`); frames hang on their keyframe and follow it.
 """
 
@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -25,7 +26,7 @@ from warpslam.poses import inverse, motion_between, motion_of, orthonormalized, 
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
 from warpslam.tracking.direct.measures import Measures
-from warpslam.tracking.direct.pyramid import PyramidPlan
+from warpslam.tracking.direct.pyramid import PyramidPlan, records
 from warpslam.tracking.direct.registrar import Floors, Registrar, new_tasks
 from warpslam.tracking.direct.window import Pose, refine_window
 from warpslam.trajectory import TWIST_STEPS, FrameHistory, Located
@@ -232,7 +233,7 @@ class DirectTracker:
         """The level where poses are judged."""
         return min(1, self.plan.top)
 
-    def _task(self, count: int = 1) -> np.ndarray:
+    def _task(self, count: int = 1) -> Any:
         tasks = new_tasks(count)
         tasks["grey"], tasks["depth"] = self.config.grey_weight, self.config.depth_weight
         return tasks
@@ -264,7 +265,7 @@ class DirectTracker:
         wanted = [k for k, share in sorted(self._overlap.items(), key=lambda item: -item[1]) if share > MIN_OVERLAP]
         joined = [reference, *[k for k in wanted if k != reference]][: max(self.config.joint, 1)]
         to_reference = inverse(W) @ np.array([self.keyframes[k].pose for k in joined])
-        joint = np.zeros(1, registration.Joint.numpy_dtype())
+        joint = records(registration.Joint)
         joint["row"], joint["count"], joint["level"] = row, len(joined), 0
         joint["keyframes"][0, : len(joined)] = [self._points_of(k) for k in joined]
         joint["iterations"] = self.config.joint_iterations if self.config.joint > 0 else 0
@@ -282,7 +283,7 @@ class DirectTracker:
         self._overlap = dict(zip(near, shares.numpy()[: len(near)].tolist(), strict=True))
         attempt = replace(self._attempt(reference, result), moved=self._shift(row, task[0]["T"], result["T"]))
         if best is not None:
-            attempt = Attempt(reference, attempt.T_frame_keyframe, attempt.exposure, best.cost, best.measures, best.grey_scale, attempt.ok)
+            attempt = replace(attempt, cost=best.cost, measures=best.measures, grey_scale=best.grey_scale)
         T, T_joint = (np.asarray(one["T"], np.float64) for one in (result, last))
         step, turn = motion_between(T_joint, T)
         if step > MAX_JOINT_STEP or turn > MAX_JOINT_TURN:
@@ -415,7 +416,7 @@ class DirectTracker:
         for one in tried:
             if not np.isfinite(one[1]).all():
                 continue
-            motions = [motion_between(np.float64(other[1]), np.float64(one[1])) for other in chosen]
+            motions = [motion_between(other[1].astype(np.float64), one[1].astype(np.float64)) for other in chosen]
             if all(step >= 0.015 or turn >= 0.7 for step, turn in motions):
                 chosen.append(one)
             if len(chosen) == 3:
@@ -690,7 +691,7 @@ class DirectTracker:
         self._motions[index] = motion
         while len(self._motions) > RECENT:
             del self._motions[min(self._motions)]
-        struct = np.zeros(1, points.Motion.numpy_dtype())
+        struct = records(points.Motion)
         twist = np.array(motion.twist)
         struct["to_depth"] = motion_of(-motion.depth_offset * twist)
         struct["velocity"], struct["spin"] = motion.readout * twist[:3], motion.readout * twist[3:]
@@ -702,7 +703,7 @@ class DirectTracker:
         motion = FrameMotion(depth_offset=frame.depth_offset, readout=self.readout)
         self._set_motion(frame.index, motion.with_twist(history.twist()))
 
-    def _ask_motion(self, joint: np.ndarray, frame: AdmittedFrame, history: FrameHistory, W: np.ndarray) -> None:
+    def _ask_motion(self, joint: Any, frame: AdmittedFrame, history: FrameHistory, W: np.ndarray) -> None:
         """Have the joint registration correct the motion by the pose that it begins with."""
         earlier = history.earlier(TWIST_STEPS - 1)
         if (frame.depth_offset == 0.0 and self.readout == 0.0) or earlier is None:
@@ -771,7 +772,7 @@ def _why_lost(best: Attempt | None) -> str:
         return "no registration to a keyframe came to an end"
     m = best.measures
     return (
-        f"{m.agreement:.0%} of the depth agrees with the nearest keyframe, grey values correlate by {m.correlation:.2f}, "
+        f"{m.agreement:.0%} of the depth agrees with the best keyframe, grey values correlate by {m.correlation:.2f}, "
         f"{m.view:.0%} of it is in view"
     )
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from warpslam.kernels.direct import registration
 from warpslam.poses import adjoint, inverse, motion_of, orthonormalized
+from warpslam.tracking.direct.pyramid import records
 from warpslam.tracking.direct.registrar import Registrar
 
 MIN_OVERLAP = 0.3
@@ -41,7 +42,7 @@ def refine_window(
     pairs = _overlapping(registrar, members)
     if not pairs:
         return poses
-    asked = np.zeros(len(pairs), registration.Pair.numpy_dtype())
+    asked = records(registration.Pair, len(pairs))
     asked["exposure"] = (1.0, 0.0)
     asked["keyframe"], asked["row"] = zip(*((members[i].points, members[j].row) for i, j in pairs), strict=True)
     count = len(members)
