@@ -12,10 +12,13 @@ from warpslam.poses import motion_of
 
 @dataclass(frozen=True)
 class SweptRoom:
-    """An axis-aligned box around the origin, seen from inside; ``pillar`` [m] is the half width of a column in it."""
+    """An axis-aligned box around the origin, seen from inside; ``pillar`` [m] is the half width of a column in it, and
+    ``grain`` the size [grey values] of a texture whose cells are 5 cm wide.
+    """
 
     half: tuple[float, float, float] = (2.0, 1.4, 2.6)
     pillar: float = 0.0
+    grain: float = 0.0
 
     def take(
         self, camera: Intrinsics, T_world_camera: np.ndarray, motion: FrameMotion
@@ -49,4 +52,6 @@ class SweptRoom:
     def _pattern(self, points: np.ndarray) -> np.ndarray:
         x, y, z = 3.0 * points.T
         waves = [np.sin(3 * x + 2 * y) * np.cos(2 * z), np.sin(4 * y - 2 * z) * np.cos(x), np.cos(2 * x + 3 * z + y)]
-        return 127.5 + 100.0 * np.stack(waves, axis=-1)
+        smooth = 127.5 + (100.0 - self.grain) * np.stack(waves, axis=-1)
+        cell = np.floor(points / 0.05 + 0.5) @ [12.9898, 78.233, 37.719]
+        return smooth + self.grain * np.sin(1e4 * np.sin(cell))[:, None]

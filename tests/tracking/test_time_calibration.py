@@ -76,8 +76,10 @@ class SweptSequence(RgbdSequence):
     name = "swept"
     intrinsics = CAMERA
 
-    def __init__(self, timing: SensorTiming = TRUE, speed: float = 1.0, *, stamped: float = 0.0) -> None:
-        self.true, self.speed, self.stamped = timing, speed, stamped
+    def __init__(
+        self, timing: SensorTiming = TRUE, speed: float = 1.0, *, stamped: float = 0.0, grain: float = 0.0
+    ) -> None:
+        self.true, self.speed, self.stamped, self.room = timing, speed, stamped, SweptRoom(grain=grain)
         rng = np.random.default_rng(0)
         self._waves = rng.uniform(2.0, 5.0, 6), rng.uniform(0.0, 6.3, 6), np.array([0.1, 0.1, 0.1, 0.12, 0.15, 0.12])
 
@@ -97,7 +99,7 @@ class SweptSequence(RgbdSequence):
         step = np.linalg.inv(self.pose(time - dt)) @ self.pose(time + dt)
         twist = np.r_[step[:3, 3], step[2, 1], step[0, 2], step[1, 0]] / (2 * dt)
         offset = self.true.depth_delay + self.stamped
-        rgb, depth = SweptRoom().take(CAMERA, pose, FrameMotion(tuple(twist), offset, self.true.readout))
+        rgb, depth = self.room.take(CAMERA, pose, FrameMotion(tuple(twist), offset, self.true.readout))
         return Frame(index, time, rgb, depth, pose, time + self.stamped if self.stamped else None)
 
 
@@ -117,6 +119,14 @@ def test_global_shutter_without_delay_is_found_to_be_one():
     """Nothing to correct: 0 and 0, to 2 ms."""
     estimate = find_timing(AlignmentCost(SweptSequence(SensorTiming()), range(FRAMES), wp.get_device("cpu")))
     assert abs(estimate.depth_delay.seconds) < 0.002 and estimate.readout.seconds < 0.002
+
+
+def test_sharp_texture_does_not_draw_away_from_nothing():
+    """Where nothing is to be corrected, a texture of cells as wide as a pixel doesn't favour what moves points off it.
+    (Compared without blur, the cost at nothing is half as high again as 10 ms away.)
+    """
+    cost = AlignmentCost(SweptSequence(SensorTiming(), grain=30.0), range(FRAMES), wp.get_device("cpu"))
+    assert cost(SensorTiming()) < 1.2 * min(cost(SensorTiming(delay, 0.0)) for delay in (-0.01, 0.01))
 
 
 def test_a_camera_that_stands_still_tells_nothing():

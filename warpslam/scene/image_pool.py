@@ -229,8 +229,9 @@ class ImagePool:
 
     @property
     def device_bytes(self) -> int:
-        """Memory of the slots."""
-        return sum(array.capacity for array in self.arrays)
+        """Memory of the slots, and of images before they are rectified."""
+        arrays = (*self.arrays, *(self._raw_current or ()), *(self._raw or ()))
+        return sum(array.capacity for array in arrays)
 
     @property
     def compact_bytes(self) -> int:
