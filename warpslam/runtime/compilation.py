@@ -28,10 +28,12 @@ _STAGES = (
     "kernels.losses",
     "kernels.grid",
     "views",
+    "features",
 )
 _PYTHON_MODULES = {
     "warpslam.rays": ("pixels", "rays", "rejection", "samples"),
     "warpslam.views": ("frustum", "images", "seen", "visibility"),
+    "warpslam.features": ("features.matching", "features.pose", "features.agreement"),
     **{f"warpslam.decoder_{target}": ("decoder.build",) for target in ("cpu", "cuda")},
     **{f"warpslam.imap_{target}": ("imap_network",) for target in ("cpu", "cuda")},
 }
