@@ -13,25 +13,32 @@ KEY_UNIT = wp.constant(65536)
 
 
 @wp.struct
+class Feature:
+    """What is measured at one feature."""
+
+    pixel: wp.vec2
+    """Column and row [px]."""
+    pixel_sigma: float
+    """Standard deviation of the position [px]."""
+    inverse_depth: float
+    """[1/m]; 0 where depth is missing."""
+    on_edge: int
+    """1 where depth steps beside the feature."""
+    octave: int
+    row_time: float
+    """When the feature's row was seen, against the middle row [s]."""
+    point: wp.vec3
+    """Camera axes at the time of the middle row [m]; (0, 0, 0) where depth is missing."""
+
+
+@wp.struct
 class Features:
     """Features of one frame, n of them, ordered by cell of the image (row by row)."""
 
     count: int
-    pixel: wp.array[wp.vec2]
-    """Column and row [px]."""
-    octave: wp.array[int]
+    feature: wp.array[Feature]
     descriptor: wp.array2d[wp.uint64]
     """(n, 4): 256 bits."""
-    point: wp.array[wp.vec3]
-    """Camera axes [m]; (0, 0, 0) where depth is missing."""
-    inverse_depth: wp.array[float]
-    """[1/m]; 0 where depth is missing."""
-    on_edge: wp.array[int]
-    """1 where depth steps beside the feature."""
-    pixel_sigma: wp.array[float]
-    """Standard deviation of the position [px]."""
-    row_time: wp.array[float]
-    """When the feature's row was seen, against the middle row [s]."""
     starts: wp.array[int]
     """First feature of each cell, and the count."""
 

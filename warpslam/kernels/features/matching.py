@@ -50,9 +50,12 @@ def match_points(
     i = wp.tid()
     row = slot * matches.stride + i
     matches.feature[row] = -1
-    if i >= source.count or source.inverse_depth[i] <= 0.0:
+    if i >= source.count:
         return
-    X = source.point[i]
+    sought = source.feature[i]
+    if sought.inverse_depth <= 0.0:
+        return
+    X = sought.point
     p = wp.transform_point(T_reference_source, X)
     x = wp.transform_point(wp.mat44(T_camera_reference[0]), p)
     if x[2] < NEAREST:
@@ -62,7 +65,7 @@ def match_points(
     if u < 0.0 or v < 0.0 or u > view.size[0] - 1.0 or v > view.size[1] - 1.0:
         return
     factor = wp.log(view.octave_factor)
-    level = source.octave[i] + int(wp.rint(wp.log(wp.length(X) / wp.length(x)) / factor))
+    level = sought.octave + int(wp.rint(wp.log(wp.length(X) / wp.length(x)) / factor))
     if level < -OCTAVES_BESIDE or level >= view.octaves + OCTAVES_BESIDE:
         return
     radius = search.radius * wp.exp(factor * float(wp.clamp(level, 0, view.octaves - 1)))
@@ -77,9 +80,9 @@ def match_points(
     second_octave = int(-1)
     for line in range(top, bottom + 1):
         for j in range(target.starts[line * view.columns + first], target.starts[line * view.columns + last + 1]):
-            octave = target.octave[j]
+            octave = target.feature[j].octave
             if octave >= level - OCTAVES_BESIDE and octave <= level + OCTAVES_BESIDE:
-                away = target.pixel[j] - wp.vec2(u, v)
+                away = target.feature[j].pixel - wp.vec2(u, v)
                 if wp.dot(away, away) <= radius * radius:
                     bits = differing_bits(source.descriptor, i, target.descriptor, j)
                     if bits < best:

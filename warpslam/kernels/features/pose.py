@@ -15,7 +15,7 @@ With a rolling shutter a feature of row time dt sees x - dt (u_v + u_w cross x) 
 
 import warp as wp
 
-from warpslam.kernels.features.arrays import MODULE, Features, Matches, Motion, View
+from warpslam.kernels.features.arrays import MODULE, Feature, Features, Matches, Motion, View
 from warpslam.kernels.gauss_newton import Mat66d, Vec6d, solve
 
 CHI2_TWO = wp.constant(5.991)
@@ -123,22 +123,22 @@ def seen_point(p: wp.vec3, row_time: float, motion: Motion) -> wp.vec3:
 
 
 @wp.func
-def residuals(x: wp.vec3, frame: Features, j: int, view: View, depth_weight: float) -> wp.vec3:
+def residuals(x: wp.vec3, feature: Feature, view: View, depth_weight: float) -> wp.vec3:
     """r_u, r_v, r_d of a point in front of the camera; ``depth_weight`` is 1 / s_d, 0 without depth."""
-    weight = 1.0 / frame.pixel_sigma[j]
-    pixel = frame.pixel[j]
+    weight = 1.0 / feature.pixel_sigma
+    pixel = feature.pixel
     return wp.vec3(
         (view.focal[0] * x[0] / x[2] + view.center[0] - pixel[0]) * weight,
         (view.focal[1] * x[1] / x[2] + view.center[1] - pixel[1]) * weight,
-        (1.0 / x[2] - frame.inverse_depth[j]) * depth_weight,
+        (1.0 / x[2] - feature.inverse_depth) * depth_weight,
     )
 
 
 @wp.func
-def depth_weight_of(frame: Features, j: int, solver: Solver) -> float:
-    if frame.inverse_depth[j] <= 0.0:
+def depth_weight_of(feature: Feature, solver: Solver) -> float:
+    if feature.inverse_depth <= 0.0:
         return 0.0
-    return 1.0 / (solver.depth_sigma * wp.where(frame.on_edge[j] != 0, solver.edge_factor, 1.0))
+    return 1.0 / (solver.depth_sigma * wp.where(feature.on_edge != 0, solver.edge_factor, 1.0))
 
 
 @wp.func
@@ -169,20 +169,21 @@ def sum_rows(
         j = matches.feature[row]
         if j >= 0:
             if matches.inlier[row] != 0:
+                feature = frame.feature[j]
                 middle = R * matches.point[row] + t
-                dt = frame.row_time[j]
+                dt = feature.row_time
                 x = seen_point(middle, dt, motion)
                 if x[2] > NEAREST:
-                    depth_weight = depth_weight_of(frame, j, solver)
-                    r = residuals(x, frame, j, view, depth_weight)
+                    depth_weight = depth_weight_of(feature, solver)
+                    r = residuals(x, feature, view, depth_weight)
                     chi2 = wp.dot(r, r)
                     limit = chi2_limit(depth_weight)
                     weight = matches.weight[row]
                     if robust and chi2 > limit:
                         weight = weight * wp.sqrt(limit / chi2)
                     z = 1.0 / x[2]
-                    a = view.focal[0] * z / frame.pixel_sigma[j]
-                    b = view.focal[1] * z / frame.pixel_sigma[j]
+                    a = view.focal[0] * z / feature.pixel_sigma
+                    b = view.focal[1] * z / feature.pixel_sigma
                     gu = by_point(wp.vec3(a, 0.0, -a * x[0] * z), dt, motion)
                     gv = by_point(wp.vec3(0.0, b, -b * x[1] * z), dt, motion)
                     gd = by_point(wp.vec3(0.0, 0.0, -z * z * depth_weight), dt, motion)
@@ -240,13 +241,14 @@ def classify(
             matched += 1
             inside = int(0)
             error = float(0.0)
-            x = seen_point(R * matches.point[row] + t, frame.row_time[j], motion)
+            feature = frame.feature[j]
+            x = seen_point(R * matches.point[row] + t, feature.row_time, motion)
             if x[2] > NEAREST:
-                depth_weight = depth_weight_of(frame, j, solver)
-                r = residuals(x, frame, j, view, depth_weight)
+                depth_weight = depth_weight_of(feature, solver)
+                r = residuals(x, feature, view, depth_weight)
                 inside = wp.where(wp.dot(r, r) <= chi2_limit(depth_weight), 1, 0)
                 if depth_weight > 0.0:
-                    error = 1.0 / x[2] - frame.inverse_depth[j]
+                    error = 1.0 / x[2] - feature.inverse_depth
             good += inside
             matches.inlier[row] = inside
             matches.depth_error[row] = error

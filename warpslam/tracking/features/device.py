@@ -10,12 +10,15 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.kernels.features.agreement import depth_agreement
-from warpslam.kernels.features.arrays import NO_OWNER, Features, Matches, Motion, View
+from warpslam.kernels.features.arrays import NO_OWNER, Feature, Features, Matches, Motion, View
 from warpslam.kernels.features.matching import Search, match_points, settle_matches
 from warpslam.kernels.features.pose import PoseState, Solver, normal_equations, robust_pose
 from warpslam.kernels.gauss_newton import Mat66d, Vec6d
 from warpslam.tracking.features.detection import DEPTH_STRIDE, FeatureFrame, cell_layout
 from warpslam.tracking.features.settings import FeatureSettings
+
+FEATURE = Feature.numpy_dtype()
+"""`Feature` as a record of NumPy."""
 
 _BLOCK = 32
 _AGREEMENT_STEP = 2
@@ -27,6 +30,8 @@ class DeviceFrame:
     """A `FeatureFrame` on the device."""
 
     features: Features
+    steady: np.ndarray
+    """Features with depth that does not step, bool (n,), on the host."""
     thin_depth: wp.array
     motion: Motion
 
@@ -46,7 +51,9 @@ class FoundPose:
     inliers: int
     """Features among them that agree with the pose."""
     depth_errors: np.ndarray
-    """1/z - 1/d of the inliers with depth, off steps [1/m], float32."""
+    """1/z - 1/d of the rows that are inliers [1/m], 0 without depth; float32 (rows,)."""
+    features: np.ndarray
+    """Feature of each of these rows, int32 (rows,)."""
 
     @property
     def share(self) -> float:
@@ -77,36 +84,24 @@ class PoseFinder:
 
     def upload(self, frame: FeatureFrame) -> DeviceFrame:
         """Bring a frame to the device."""
-        inverse = np.where(frame.depth > 0, 1.0 / np.maximum(frame.depth, 1e-6), 0.0)
-        sigma = self.settings.pixel_sigma * self.settings.scales[frame.octaves]
-        features = self.features(frame.pixels, inverse, sigma, frame.on_edge, frame.row_times)
-        features.octave = self._array(frame.octaves, int)
+        measured = np.zeros(len(frame), FEATURE)
+        measured["pixel"], measured["octave"], measured["point"] = frame.pixels, frame.octaves, frame.points
+        measured["pixel_sigma"] = self.settings.pixel_sigma * self.settings.scales[frame.octaves]
+        measured["inverse_depth"] = np.where(frame.depth > 0, 1.0 / np.maximum(frame.depth, 1e-6), 0.0)
+        measured["on_edge"], measured["row_time"] = frame.on_edge, frame.row_times
+        features = self.measurements(measured)
         features.descriptor = self._array(frame.descriptors.view(np.uint64), wp.uint64)
-        features.point = self._array(frame.points, wp.vec3)
         features.starts = self._array(frame.starts, int)
         motion = Motion()
         motion.translation, motion.rotation = wp.vec3(*frame.twist[:3]), wp.vec3(*frame.twist[3:])
-        return DeviceFrame(features, self._array(frame.thin_depth, float), motion)
+        steady = (frame.depth > 0) & ~frame.on_edge
+        return DeviceFrame(features, steady, self._array(frame.thin_depth, float), motion)
 
-    def features(
-        self,
-        pixels: np.ndarray,
-        inverse_depth: np.ndarray,
-        pixel_sigma: np.ndarray,
-        on_edge: np.ndarray | None = None,
-        row_times: np.ndarray | None = None,
-    ) -> Features:
-        """Measurements to find a pose from, that are not matched by projection themselves: (n, 2) [px], (n,) [1/m] with
-        0 where depth is missing, (n,) [px], bool (n,), (n,) [s].
-        """
-        n = len(pixels)
+    def measurements(self, measured: np.ndarray) -> Features:
+        """What a pose can be found from, but not matched by projection: records of type `FEATURE` (n,)."""
         features = Features()
-        features.count = n
-        features.pixel = self._array(pixels, wp.vec2)
-        features.inverse_depth = self._array(inverse_depth, float)
-        features.pixel_sigma = self._array(pixel_sigma, float)
-        features.on_edge = self._array(np.zeros(n, np.int32) if on_edge is None else on_edge, int)
-        features.row_time = self._array(np.zeros(n, np.float32) if row_times is None else row_times, float)
+        features.count = len(measured)
+        features.feature = self._array(measured, Feature)
         return features
 
     def match(
@@ -194,14 +189,14 @@ class PoseFinder:
         feature = self._matches.feature[:rows].numpy()
         inlier = (self._matches.inlier[:rows].numpy() != 0) & (feature >= 0)
         good = feature[inlier]
-        steady = (features.on_edge.numpy()[good] == 0) & (features.inverse_depth.numpy()[good] > 0)
         return FoundPose(
             T_camera_reference=state.T_camera_reference.numpy()[0].copy(),
             H=state.normal.numpy()[0].copy(),
             b=state.right.numpy()[0].copy(),
             matches=_distinct(feature[feature >= 0], features.count),
             inliers=_distinct(good, features.count),
-            depth_errors=self._matches.depth_error[:rows].numpy()[inlier][steady],
+            depth_errors=self._matches.depth_error[:rows].numpy()[inlier],
+            features=good,
         )
 
     def _resize(self, slots: int, stride: int, features: int) -> None:
@@ -221,8 +216,8 @@ class PoseFinder:
             matches.owner = wp.zeros((self._slots, self._features), dtype=int, device=device)
 
     def _array(self, values: np.ndarray, dtype: type) -> wp.array:
-        kind = {int: np.int32, wp.uint64: np.uint64}.get(dtype, np.float32)
-        return wp.array(np.ascontiguousarray(values, kind), dtype=dtype, device=self.device)
+        # On the CPU the array lends its memory.
+        return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device, copy=self.device.is_cuda)
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, int], inputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, block_dim=_BLOCK, record_tape=False)

@@ -15,9 +15,8 @@ import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics
-from warpslam.poses import orthonormalized
 from warpslam.tracking.features.detection import DEPTH_STRIDE, FeatureFrame, depth_at
-from warpslam.tracking.features.device import DeviceFrame, FoundPose, PoseFinder
+from warpslam.tracking.features.device import FEATURE, DeviceFrame, FoundPose, PoseFinder
 from warpslam.tracking.features.pairs import descriptor_pairs, flow_pairs, ransac_pose
 from warpslam.tracking.features.settings import FeatureSettings
 
@@ -122,7 +121,7 @@ class FeatureWitness:
         Returns:
             None if features do not tell.
         """
-        reference = orthonormalized(previous[2] if predicted is None else predicted)
+        reference = _rigid(previous[2] if predicted is None else predicted)
         by, found = self._follow(frame, grey, previous, reference)
         local = [number for number in candidates if number in self._keyframes][: self.settings.local_keyframes]
         if found is None:
@@ -130,7 +129,7 @@ class FeatureWitness:
         by_keyframes = self._by_keyframes(frame, keyframe_poses, local, reference, found)
         held = by_keyframes or found
         if by_keyframes is not None:
-            self._learn(by_keyframes)
+            self._learn(self._device_frame(frame), by_keyframes)
         T_previous_world = np.linalg.inv(previous[2])
         witness = self._witness(frame, held, reference, previous[0], T_previous_world, by, by_keyframes is not None)
         if witness.is_held:
@@ -246,11 +245,14 @@ class FeatureWitness:
             return None
         depth, on_edge = depth_at(frame.thin_depth, pixels / DEPTH_STRIDE, self.settings.max_depth)
         inverse = np.where(depth > 0, 1.0 / np.maximum(depth, 0.1), 0.0)
-        features = self._finder.features(pixels, inverse, np.ones(len(pixels)), on_edge)
+        measured = np.zeros(len(pixels), FEATURE)
+        measured["pixel"], measured["pixel_sigma"] = pixels, 1.0
+        measured["inverse_depth"], measured["on_edge"] = inverse, on_edge
         points = points @ T_reference_before[:3, :3].T + T_reference_before[:3, 3]
         self._finder.pair(points, np.arange(len(pixels)), len(pixels))
         T_camera_reference = start[0] @ np.linalg.inv(T_reference_before)
         motion = self._device_frame(frame).motion
+        features = self._finder.measurements(measured)
         found = self._finder.solve(features, motion, T_camera_reference, max(self.depth_sigma, 0.01))
         good = found.inliers >= LEAST_BY_PREVIOUS and found.share >= LEAST_FLOW_SHARE
         return found if good else None
@@ -314,15 +316,16 @@ class FeatureWitness:
         by: str,
         by_keyframes: bool,
     ) -> Witness:
-        pose = orthonormalized(reference @ np.linalg.inv(found.T_camera_reference))
+        pose = _rigid(reference @ np.linalg.inv(found.T_camera_reference))
         mine, others = self._device_frame(frame), self._device_frame(other)
         agreement, compared = self._finder.agreement(mine, others, T_other_world @ pose)
         return Witness(pose, found.inliers, found.matches, agreement, compared, found.H, by, by_keyframes)
 
-    def _learn(self, found: FoundPose) -> None:
+    def _learn(self, frame: DeviceFrame, found: FoundPose) -> None:
         """The running deviation of inverse depth: registration, time and blur make it several times a sensor's noise."""
-        if found.inliers > 30 and len(found.depth_errors) > 20:
-            now = DEPTH_SIGMA_FACTOR * float(np.median(np.abs(found.depth_errors)))
+        errors = found.depth_errors[frame.steady[found.features]]
+        if found.inliers > 30 and len(errors) > 20:
+            now = DEPTH_SIGMA_FACTOR * float(np.median(np.abs(errors)))
             mixed = (1.0 - DEPTH_SIGMA_RATE) * self.depth_sigma + DEPTH_SIGMA_RATE * now
             self.depth_sigma = float(np.clip(mixed, *DEPTH_SIGMA_RANGE))
 
@@ -347,3 +350,11 @@ class FeatureRows:
         """
         T = np.linalg.inv(T_world_camera) @ self._T_world_reference
         return self._finder.evaluate(self._frame.features, self._frame.motion, T, self._depth_sigma)
+
+
+def _rigid(T: np.ndarray) -> np.ndarray:
+    """The transform (4, 4), float64, with its rotation made one to the last digits: products of many drift off."""
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    result = np.array(T, dtype=np.float64)
+    result[:3, :3] = U @ Vt
+    return result
