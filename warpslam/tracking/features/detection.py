@@ -71,7 +71,7 @@ def detect(
         settings: Constants.
     """
     settings = settings or FeatureSettings()
-    scale = settings.image_scale
+    scale = 0.5 if camera.width >= settings.halved_from else 1.0
     image = grey if scale == 1.0 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     orb = _detector(settings)
     corners = orb.detect(image, None)
