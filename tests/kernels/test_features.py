@@ -1,4 +1,4 @@
-"""Kernels of sparse features against NumPy: matching by projection, residuals and their derivatives, the robust pose."""
+"""Kernels of sparse features against NumPy: matching by projection, residuals, their derivatives, the robust pose."""
 
 from __future__ import annotations
 
@@ -91,14 +91,18 @@ def test_normal_equations_are_those_of_numeric_derivatives(finder, noise):
     r, step = residuals(T, points, measured, twist), 1e-5
     J = np.stack(
         [
-            (residuals(exp(e) @ T, points, measured, twist) - residuals(exp(-e) @ T, points, measured, twist)) / 2 / step
+            (residuals(exp(e) @ T, points, measured, twist) - residuals(exp(-e) @ T, points, measured, twist))
+            / 2
+            / step
             for e in step * np.eye(6)
         ],
         axis=-1,
     )
     W = weights(r, measured)
     assert (W < 1).any() if noise > 1 else (W < 1).mean() < 0.05
-    np.testing.assert_allclose(found.H, np.einsum("n,nki,nkj->ij", W, J, J), rtol=1e-3, atol=1e-4 * np.abs(found.H).max())
+    np.testing.assert_allclose(
+        found.H, np.einsum("n,nki,nkj->ij", W, J, J), rtol=1e-3, atol=1e-4 * np.abs(found.H).max()
+    )
     np.testing.assert_allclose(found.b, np.einsum("n,nki,nk->i", W, J, r), rtol=1e-3, atol=1e-4 * np.abs(found.b).max())
 
 
@@ -220,7 +224,7 @@ def test_a_feature_seen_by_two_keyframes_is_one_measurement(finder):
 
 
 def test_agreement_of_depth(finder):
-    """A wall that the camera steps back from agrees if the step is known, by 3 of 4 pixels if a quarter of it is gone."""
+    """A wall that the camera steps back from agrees if the step is known, and by 3 of 4 if a quarter is elsewhere."""
     wall = np.full((60, 80), 2.0, np.float32)
     back = np.full((60, 80), 2.1, np.float32)
     T = np.eye(4)

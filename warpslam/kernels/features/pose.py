@@ -283,9 +283,7 @@ def robust_pose(
     while n < solver.rounds:
         iteration = int(0)
         while iteration < solver.iterations:
-            sums = sum_rows(
-                lane, wp.mat33(R), wp.vec3(t), matches, frame, view, motion, solver, n < solver.rounds - 1
-            )
+            sums = sum_rows(lane, wp.mat33(R), wp.vec3(t), matches, frame, view, motion, solver, n < solver.rounds - 1)
             H = normal_of(sums)
             for k in range(6):
                 H[k, k] = H[k, k] + DAMPING

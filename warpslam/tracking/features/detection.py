@@ -75,19 +75,19 @@ def detect(
     image = grey if scale == 1.0 else cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     orb = _detector(settings)
     corners = orb.detect(image, None)
-    positions = _pixels(corners, scale)
+    positions = _pixels(corners, scale, settings)
     strength = np.fromiter(map(attrgetter("response"), corners), np.float32, len(corners))
     cell, _ = _cells(positions, camera, settings)
     order = np.lexsort((-strength, cell))
     rank = np.arange(len(order)) - np.searchsorted(cell[order], cell[order], side="left")
     chosen = order[rank < settings.per_cell][:MAX_FEATURES]
     # ORB describes octave by octave, and would change the order.
-    chosen = chosen[np.lexsort((chosen, [corners[i].octave for i in chosen]))] if len(chosen) else chosen
+    chosen = chosen[np.lexsort((chosen, _octaves(corners)[chosen]))]
     corners, descriptors = orb.compute(image, [corners[i] for i in chosen])
     if descriptors is None:
         descriptors = np.zeros((0, 32), np.uint8)
-    pixels = _pixels(corners, scale)
-    octaves = np.fromiter(map(attrgetter("octave"), corners), np.int32, len(corners))
+    octaves = _octaves(corners)
+    pixels = _pixels(corners, scale, settings)
     cell, count = _cells(pixels, camera, settings)
     order = np.argsort(cell, kind="stable")
     pixels = pixels[order]
@@ -195,10 +195,19 @@ def _detector(settings: FeatureSettings) -> Any:
     )
 
 
-def _pixels(corners: Any, scale: float) -> np.ndarray:
-    """Positions in the image as it came in; pixel centres are at whole numbers in both."""
+def _octaves(corners: Any) -> np.ndarray:
+    return np.fromiter(map(attrgetter("octave"), corners), np.int32, len(corners))
+
+
+def _pixels(corners: Any, scale: float, settings: FeatureSettings) -> np.ndarray:
+    """Positions in the image as it came in.
+
+    Pixel centres are at whole numbers in every image. OpenCV only multiplies a position in a level by the level's
+    scale s, which leaves it (s - 1) / 2 too far to the left and top.
+    """
     positions = np.asarray(cv2.KeyPoint.convert(corners), dtype=np.float32).reshape(-1, 2)
-    return positions if scale == 1.0 else ((positions + 0.5) / scale - 0.5).astype(np.float32)
+    positions = positions + 0.5 * (settings.scales[_octaves(corners)][:, None] - 1.0)
+    return ((positions + 0.5) / scale - 0.5).astype(np.float32)
 
 
 def cell_layout(camera: Intrinsics, settings: FeatureSettings) -> tuple[int, int]:

@@ -17,7 +17,7 @@ from warpslam.kernels.gauss_newton import Mat66d, Vec6d
 from warpslam.tracking.features.detection import DEPTH_STRIDE, FeatureFrame, cell_layout
 from warpslam.tracking.features.settings import FeatureSettings
 
-FEATURE = Feature.numpy_dtype()
+FEATURE: np.dtype = np.dtype(Feature.numpy_dtype())  # type: ignore[attr-defined]
 """`Feature` as a record of NumPy."""
 
 _BLOCK = 32

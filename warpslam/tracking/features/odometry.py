@@ -85,7 +85,8 @@ class FeatureOdometry:
         self.witness.add_keyframe(number, frame)
         self.keyframe_poses[number] = pose
         points = frame.points[frame.depth > 0]
-        self._samples.append(points[np.linspace(0, len(points) - 1, SAMPLED_POINTS).astype(int)] if len(points) else points)
+        spread = np.linspace(0, len(points) - 1, SAMPLED_POINTS if len(points) else 0).astype(int)
+        self._samples.append(points[spread])
         self._gap = 0
 
     def _likely(self, pose: np.ndarray) -> list[int]:

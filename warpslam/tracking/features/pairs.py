@@ -1,6 +1,8 @@
-"""Pairs of features without a guess of the motion: by optical flow, by descriptors alone; and the pose of such pairs."""
+"""Pairs of features without a guess of the motion: by optical flow, by descriptors alone; the pose of such pairs."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import cv2
 import numpy as np
@@ -29,9 +31,14 @@ def flow_pairs(before: np.ndarray, after: np.ndarray, pixels: np.ndarray) -> tup
         Where they are in ``after``, float32 (n, 2), and which were followed, bool (n,).
     """
     start = np.ascontiguousarray(pixels, np.float32)[:, None]
-    options = {"winSize": FLOW_WINDOW, "maxLevel": FLOW_LEVELS}
-    moved, forth, _ = cv2.calcOpticalFlowPyrLK(before, after, start, None, **options)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(after, before, moved, None, **options)
+
+    def flow(a: np.ndarray, b: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        nowhere: Any = None
+        there, found, _ = cv2.calcOpticalFlowPyrLK(a, b, points, nowhere, winSize=FLOW_WINDOW, maxLevel=FLOW_LEVELS)
+        return there, found
+
+    moved, forth = flow(before, after, start)
+    back, returned = flow(after, before, moved)
     moved, gap = moved.reshape(-1, 2), np.linalg.norm((back - start).reshape(-1, 2), axis=1)
     height, width = after.shape
     followed = (forth.ravel() > 0) & (returned.ravel() > 0) & (gap < FLOW_RETURN)

@@ -27,9 +27,8 @@ LEAST_SHARE = 0.4
 LEAST_FLOW_SHARE = 0.3
 MANY = 60
 """Inliers from which a place is taken without looking further."""
-COMPARED = 6
-"""Thinned pixels from which agreement of depth says something, as a multiple of what it is computed on: 100 pixels."""
 LEAST_COMPARED = 100
+"""Pixels from which agreement of depth says something."""
 FLOW_COUNT = 400
 DEPTH_SIGMA_RANGE = (0.002, 0.04)
 DEPTH_SIGMA_RATE = 0.05
@@ -80,7 +79,7 @@ Previous = tuple[FeatureFrame, np.ndarray, np.ndarray]
 
 
 class FeatureWitness:
-    """Keeps the features of keyframes and finds frames among them. What it learns is `depth_sigma`, and nothing else."""
+    """Keeps the features of keyframes and finds frames among them. What it learns is `depth_sigma`, nothing else."""
 
     def __init__(self, camera: Intrinsics, device: wp.Device, settings: FeatureSettings | None = None) -> None:
         self.camera, self.device = camera, device
@@ -139,7 +138,7 @@ class FeatureWitness:
     def relocalize(
         self, frame: FeatureFrame, keyframe_poses: Mapping[int, np.ndarray], candidates: Sequence[int]
     ) -> Witness | None:
-        """Where a frame is of which nothing is known, by its descriptors; the place of most inliers among ``candidates``.
+        """Where a frame is of which nothing is known, by its descriptors: at the candidate with the most inliers.
 
         Args:
             frame: Its features.
@@ -322,7 +321,7 @@ class FeatureWitness:
         return Witness(pose, found.inliers, found.matches, agreement, compared, found.H, by, by_keyframes)
 
     def _learn(self, frame: DeviceFrame, found: FoundPose) -> None:
-        """The running deviation of inverse depth: registration, time and blur make it several times a sensor's noise."""
+        """Running deviation of inverse depth: registration, time and blur make it several times a sensor's noise."""
         errors = found.depth_errors[frame.steady[found.features]]
         if found.inliers > 30 and len(errors) > 20:
             now = DEPTH_SIGMA_FACTOR * float(np.median(np.abs(errors)))
@@ -345,8 +344,10 @@ class FeatureRows:
         self._T_world_reference = T_world_reference
 
     def at(self, T_world_camera: np.ndarray) -> FoundPose:
-        """H = J' W J and b = J' W r at a pose (4, 4), for the step xi = -H^-1 b of T_camera_world <- exp(xi) T_camera_world.
-        Huber weights; whitened, so that both are in units of one over the squares of the step.
+        """H = J' W J and b = J' W r at a pose (4, 4), Huber-weighted.
+
+        For the step xi = -H^-1 b of T_camera_world <- exp(xi) T_camera_world, xi = (v, w) [m, rad]; residuals are in
+        units of their standard deviation.
         """
         T = np.linalg.inv(T_world_camera) @ self._T_world_reference
         return self._finder.evaluate(self._frame.features, self._frame.motion, T, self._depth_sigma)
