@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.poses import motion_between, orthonormalized
-from warpslam.tracking.features.detection import FeatureFrame, detect
+from warpslam.tracking.features.detection import FeatureFrame, SensorTiming, detect, retimed
 from warpslam.tracking.features.settings import FeatureSettings
 from warpslam.tracking.features.witness import FeatureWitness, Witness
 
@@ -38,40 +39,75 @@ class OdometryFrame:
 class FeatureOdometry:
     """Keyframes by motion and by how many inliers are left, poses as they come; nothing is refined afterwards."""
 
-    def __init__(self, camera: Intrinsics, device: wp.Device | str, settings: FeatureSettings | None = None) -> None:
-        self.camera = camera
+    def __init__(
+        self,
+        camera: Intrinsics,
+        device: wp.Device | str,
+        settings: FeatureSettings | None = None,
+        timing: SensorTiming | None = None,
+    ) -> None:
+        self.camera, self.timing = camera, timing
         self.settings = settings or FeatureSettings()
         self.witness = FeatureWitness(camera, wp.get_device(device), self.settings)
         self.keyframe_poses: dict[int, np.ndarray] = {}
         self._samples: list[np.ndarray] = []
         self._previous: tuple[FeatureFrame, np.ndarray, np.ndarray] | None = None
         self._velocity = np.eye(4)
+        self._past: list[tuple[float, np.ndarray]] = []
         self._usual = 0
         self._gap = 0
 
-    def step(self, grey: np.ndarray, depth: np.ndarray) -> OdometryFrame:
-        """One frame: uint8 (H, W), z-depth [m] float32 (H, W) with 0 = missing."""
+    def step(self, grey: np.ndarray, depth: np.ndarray, time: float = 0.0) -> OdometryFrame:
+        """One frame: uint8 (H, W), z-depth [m] float32 (H, W) with 0 = missing, time [s] where timing is corrected."""
         frame = detect(grey, depth, self.camera, self.settings)
         if self._previous is None:
             self._add_keyframe(frame, np.eye(4))
-            self._previous = frame, grey, np.eye(4)
-            return OdometryFrame(np.eye(4), True, keyframe=True)
+            return self._take(frame, grey, np.eye(4), time, None, True)
         last = self._previous[2]
         predicted = last @ self._velocity
+        timed = self._timed(frame, depth)
         witness = self.witness.locate(
-            frame, grey, self._previous, self.keyframe_poses, predicted, self._likely(predicted)
+            timed, grey, self._previous, self.keyframe_poses, predicted, self._likely(predicted)
         )
         if witness is None:
             self._velocity = np.eye(4)
+            self._past = []
             return OdometryFrame(last, False)
         pose = witness.T_world_camera
         self._velocity = orthonormalized(np.linalg.inv(last) @ pose)
-        self._previous = frame, grey, pose
         self._gap += 1
         wanted = self._wants_keyframe(pose, witness)
+        result = self._take(timed, grey, pose, time, witness, wanted)
         if wanted:
-            self._add_keyframe(frame, pose)
-        return OdometryFrame(pose, True, witness, wanted)
+            # With the motion that led here, which was not known before.
+            self._add_keyframe(self._timed(frame, depth), pose)
+        return result
+
+    def _take(
+        self,
+        frame: FeatureFrame,
+        grey: np.ndarray,
+        pose: np.ndarray,
+        time: float,
+        witness: Witness | None,
+        keyframe: bool,
+    ) -> OdometryFrame:
+        self._previous = frame, grey, pose
+        self._past = [*self._past[-2:], (time, pose)]
+        return OdometryFrame(pose, True, witness, keyframe)
+
+    def _timed(self, frame: FeatureFrame, depth: np.ndarray) -> FeatureFrame:
+        """The frame with its depth and rows at the time of its middle row; twist over the last two steps, since over
+        one an error of a pose would move the next frame's depth as far.
+        """
+        if self.timing is None or len(self._past) < 2:
+            return frame
+        (start, first), (end, last) = self._past[0], self._past[-1]
+        motion = np.linalg.inv(first) @ last
+        turn = cv2.Rodrigues(motion[:3, :3])[0][:, 0]
+        shift = motion[:3, 3] - 0.5 * np.cross(turn, motion[:3, 3])
+        twist = np.concatenate([shift, turn]) / max(end - start, 1e-3)
+        return retimed(frame, depth, self.camera, self.settings, self.timing, twist)
 
     def _wants_keyframe(self, pose: np.ndarray, witness: Witness) -> bool:
         if self._gap == 1:
