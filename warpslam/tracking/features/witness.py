@@ -85,7 +85,9 @@ class FeatureWitness:
         self.camera, self.device = camera, device
         self.settings = settings or FeatureSettings()
         self.depth_sigma = self.settings.depth_sigma
-        """Standard deviation of inverse depth between frames [1/m], a running value."""
+        """Standard deviation of inverse depth between frames [1/m], a running value: all that a checkpoint needs beside
+        the images of the keyframes.
+        """
         self._keyframes: dict[int, FeatureFrame] = {}
         self._finder = PoseFinder(camera, device, self.settings)
         self._uploaded: WeakKeyDictionary[FeatureFrame, DeviceFrame] = WeakKeyDictionary()
@@ -127,13 +129,13 @@ class FeatureWitness:
             return self.relocalize(frame, keyframe_poses, candidates)
         by_keyframes = self._by_keyframes(frame, keyframe_poses, local, reference, found)
         held = by_keyframes or found
-        if by_keyframes is not None:
-            self._learn(self._device_frame(frame), by_keyframes)
         T_previous_world = np.linalg.inv(previous[2])
         witness = self._witness(frame, held, reference, previous[0], T_previous_world, by, by_keyframes is not None)
-        if witness.is_held:
-            return witness
-        return None
+        if not witness.is_held:
+            return None
+        if by_keyframes is not None:
+            self._learn(self._device_frame(frame), by_keyframes)
+        return witness
 
     def relocalize(
         self, frame: FeatureFrame, keyframe_poses: Mapping[int, np.ndarray], candidates: Sequence[int]
