@@ -159,13 +159,18 @@ def two_frames(count: int) -> tuple[FeatureFrame, FeatureFrame, np.ndarray]:
     pixels = rng.uniform([5, 5], [314, 234], (count, 2))
     descriptors, z = rng.integers(0, 256, (count, 32), dtype=np.uint8), rng.uniform(1.0, 3.0, count)
     z[::7] = 0.0
+    # Some have a double beside them that wants the same feature.
+    doubles = descriptors[:60] ^ np.packbits(rng.random((60, 256)) < 0.03, axis=1)
+    pixels, z = np.vstack([pixels, pixels[:60] + 0.5]), np.append(z, z[:60])
+    descriptors = np.vstack([descriptors, doubles])
     a = random_frame(rng, pixels, descriptors, z)
     T = exp(np.array([0.02, -0.01, 0.02, 0.01, 0.02, -0.01]))
     x = a.points @ T[:3, :3].T + T[:3, 3]
     known = a.depth > 0
     there = np.column_stack(CAMERA.project(*np.where(known[:, None], x, 1.0).T))
-    noisy = a.descriptors ^ np.packbits(rng.random((count, 256)) < 0.08, axis=1)
-    kept = known & (there > 2).all(axis=1) & (there[:, 0] < 318) & (there[:, 1] < 238)
+    noisy = a.descriptors ^ np.packbits(rng.random((len(a), 256)) < 0.08, axis=1)
+    alone = np.array([not np.any(np.abs(a.pixels[:i] - a.pixels[i]).max(axis=1) < 0.6) for i in range(len(a))])
+    kept = known & alone & (there > 2).all(axis=1) & (there[:, 0] < 318) & (there[:, 1] < 238)
     more = rng.uniform([5, 5], [314, 234], (count, 2))
     b = random_frame(
         rng,
@@ -196,6 +201,7 @@ def reference_matches(a: FeatureFrame, b: FeatureFrame, T: np.ndarray, radius: f
         if rest and b.octaves[rest[0][1]] == b.octaves[best[1]] and best[0] > ratio * rest[0][0]:
             continue
         bids.setdefault(best[1], []).append((best[0], i))
+    assert sum(len(offers) > 1 for offers in bids.values()) > 20
     return {min(offers)[1]: j for j, offers in bids.items()}
 
 
