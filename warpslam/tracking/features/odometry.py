@@ -120,25 +120,19 @@ class FeatureOdometry:
         number = len(self.keyframe_poses)
         self.witness.add_keyframe(number, frame)
         self.keyframe_poses[number] = pose
-        points = frame.points[frame.depth > 0]
-        spread = np.linspace(0, len(points) - 1, SAMPLED_POINTS if len(points) else 0).astype(int)
-        self._samples.append(points[spread])
+        points = frame.points[frame.depth > 0] if (frame.depth > 0).any() else np.zeros((1, 3), np.float32)
+        self._samples.append(points[np.linspace(0, len(points) - 1, SAMPLED_POINTS).astype(int)])
         self._gap = 0
 
     def _likely(self, pose: np.ndarray) -> list[int]:
         """Late keyframes by how much of them a pose has in view; the last one comes first."""
-        shares = []
         first = max(0, len(self._samples) - RECENT)
-        for number in range(first, len(self._samples)):
-            T = np.linalg.inv(pose) @ self.keyframe_poses[number]
-            x = self._samples[number] @ T[:3, :3].T + T[:3, 3]
-            if not len(x):
-                shares.append(0.0)
-                continue
-            u, v = self.camera.project(x[:, 0], x[:, 1], np.maximum(x[:, 2], 1e-3))
-            seen = (x[:, 2] > 0.1) & (u >= 0) & (v >= 0) & (u < self.camera.width) & (v < self.camera.height)
-            shares.append(float(seen.mean()))
-        order = sorted(range(len(shares)), key=lambda n: (-shares[n], -n))
         last = len(self._samples) - 1
-        near = [first + n for n in order if shares[n] > LEAST_IN_VIEW and first + n != last]
+        T = np.linalg.inv(pose) @ np.stack([self.keyframe_poses[number] for number in range(first, last + 1)])
+        x = np.einsum("nij,nkj->nki", T[:, :3, :3], np.stack(self._samples[first:])) + T[:, None, :3, 3]
+        u, v = self.camera.project(x[..., 0], x[..., 1], np.maximum(x[..., 2], 1e-3))
+        seen = (x[..., 2] > 0.1) & (u >= 0) & (v >= 0) & (u < self.camera.width) & (v < self.camera.height)
+        shares = seen.mean(axis=1)
+        order = np.lexsort((-np.arange(len(shares)), -shares))
+        near = [first + int(n) for n in order if shares[n] > LEAST_IN_VIEW and first + n != last]
         return [last, *near]
