@@ -251,6 +251,7 @@ def _direct(fields: StateFields, frames: int, keyframes: int) -> DirectState | N
         raise fields.damaged("direct_anchors", f"{count} frames of {frames}, keyframes up to {anchors.max(initial=-1)}")
     try:
         reference, before, confirmed = (int(header[name]) for name in ("reference", "before", "confirmed"))
+        depth_sigma = float(header["depth_sigma"])
         scale, cost = (np.inf if header[name] is None else float(header[name]) for name in ("scale", "cost"))
     except (KeyError, TypeError, ValueError) as error:
         raise fields.damaged("direct", error) from None
@@ -264,6 +265,7 @@ def _direct(fields: StateFields, frames: int, keyframes: int) -> DirectState | N
         before=before,
         found=fields.array("direct_found", np.float64, (2, 4, 4)).copy(),
         confirmed=confirmed,
+        depth_sigma=depth_sigma,
         typical=(scale, cost),
     )
 

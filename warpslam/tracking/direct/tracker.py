@@ -28,7 +28,9 @@ from warpslam.scene.keyframes import Keyframe
 from warpslam.tracking.direct.measures import Measures
 from warpslam.tracking.direct.pyramid import PyramidPlan, records
 from warpslam.tracking.direct.registrar import Floors, Registrar, new_tasks
+from warpslam.tracking.direct.second import Picture, SecondWitness
 from warpslam.tracking.direct.window import Pose, refine_window
+from warpslam.tracking.features.witness import Witness
 from warpslam.trajectory import TWIST_STEPS, FrameHistory, Located
 
 RECENT = 4
@@ -53,6 +55,10 @@ CONFIRMATIONS = 3
 """Frames that must follow before a place found again is believed."""
 UNIQUE = 1.5
 """Another place that costs less than this multiple of the best is as likely."""
+WITNESS_KEYFRAMES = 5
+"""Keyframes whose features a frame is matched with."""
+DIFFERENT_STEP, DIFFERENT_TURN = 0.03, 1.5
+"""Two answers that are further apart [m], [degrees] contradict each other."""
 DECISIVE = 0.7
 """Another pose than the one foretold must cost less than this multiple of what that one costs."""
 NEAR_SHIFT = 2.0
@@ -137,6 +143,14 @@ class _Before:
     kept: tuple[np.ndarray, np.ndarray, float] | None
     """Its images as the pool held them; None where they are on a GPU."""
 
+    @property
+    def picture(self) -> Picture:
+        """The frame as it comes back from a file."""
+        if self.kept is None:
+            return Picture(self.rgb, self.depth)
+        rgb, units, scale = self.kept
+        return Picture(rgb, units.astype(np.float32) * np.float32(scale))
+
 
 @dataclass(frozen=True)
 class DirectState:
@@ -156,6 +170,8 @@ class DirectState:
     """A place that is not confirmed yet: its pose and the motion there, float64 (2, 4, 4)."""
     confirmed: int
     """Frames that agree with it; 0 = there is no such place."""
+    depth_sigma: float
+    """What the second witness has learnt of depth [1/m]."""
     typical: tuple[float, float]
     """Running means of the photometric scale and of the cost; infinite = none yet."""
 
@@ -203,6 +219,7 @@ class DirectTracker:
         self._before: _Before | None = None
         self._found: _Found | None = None
         self._rotations = rotation_grid(config.search_span)
+        self._second = SecondWitness(camera, device, max_depth, keyframes, images)
         self.counts = {"sure": 0, "searched": 0}
 
     # -- what Slam asks ------------------------------------------------------------------------------------------
@@ -236,7 +253,7 @@ class DirectTracker:
                 best, done = done.attempt, None
         if done is None:
             self.counts["searched"] += 1
-            best = self._look_everywhere(row, history, starts, best)
+            best = self._look_everywhere(row, frame, history, starts, best)
             if best is None or not self._is_good(best):
                 self._found = None
                 self._keep_before(history)
@@ -447,25 +464,68 @@ class DirectTracker:
     # -- search --------------------------------------------------------------------------------------------------
 
     def _look_everywhere(
-        self, row: int, history: FrameHistory, starts: Sequence[np.ndarray], best: Attempt | None
+        self,
+        row: int,
+        frame: AdmittedFrame,
+        history: FrameHistory,
+        starts: Sequence[np.ndarray],
+        best: Attempt | None,
     ) -> Attempt | None:
         """At the reference, at the frame before, at older keyframes, until a pose is believed."""
+        picture = self._picture(frame)
         if history.last_known is not None or self._found is not None:
+            witness = self._ask(picture, history, starts[0])
             poses = [*starts, *self._turned(row, starts)]
             found = self._search(row, self._reference, poses, starts[0], None)
             if best is None or not self._is_good(best) or best.moved > NEAR_SHIFT:
                 best = _better(best, found, by_cost=True)
             elif found is not None and self._is_good(found) and found.cost < DECISIVE * best.cost:
                 best = found
+            best = self._judge(row, best, witness)
             if best is not None and self._is_good(best):
                 return best
             before = self._before
             if history.was_known and before is not None and before.index != self._reference_frame:
                 self._keep_before(history)
                 best = _better(best, self._search(row, self._reference, poses, starts[0], None))
+                best = self._judge(row, best, witness)
                 if best is not None and self._is_good(best):
                     return best
-        return _better(best, self._relocalize(row))
+        return _better(best, self._relocalize(row, picture))
+
+    def _picture(self, frame: AdmittedFrame) -> Picture:
+        """The frame as it comes back from a file."""
+        if not self.device.is_cpu:
+            return Picture(frame.rgb, frame.depth)
+        rgb, units, scale = self.images.current()
+        return Picture(rgb, units.astype(np.float32) * np.float32(scale))
+
+    def _ask(self, picture: Picture, history: FrameHistory, foretold: np.ndarray) -> Witness | None:
+        """What features say, if the frame follows one whose pose is known."""
+        before = self._before
+        if before is None or not history.was_known:
+            return None
+        likely = sorted(self._overlap.items(), key=lambda item: -item[1])
+        keyframes = list(dict.fromkeys([self._reference, *(k for k, _ in likely)]))[:WITNESS_KEYFRAMES]
+        return self._second.locate(picture, before.picture, history.last_pose, foretold, keyframes)
+
+    def _judge(self, row: int, best: Attempt | None, witness: Witness | None) -> Attempt | None:
+        """Where features say something else, a third measure decides: which of both answers the images fit better."""
+        if witness is None:
+            return best
+        if best is not None:
+            step, turn = motion_between(self._pose_of(best), witness.T_world_camera)
+            if step < DIFFERENT_STEP and turn < DIFFERENT_TURN:
+                return best
+        task = self._task()
+        task["keyframe"], task["row"], task["cost_level"] = self._points_of(self._reference), row, 0
+        task["top"] = self.judged
+        task["T"] = inverse(witness.T_world_camera) @ self.keyframes[self._reference].pose
+        other = self._attempt(self._reference, self.registrar.register(task)[0])
+        other = replace(other, moved=self._shift(row, task[0]["T"], other.T_frame_keyframe))
+        if best is None or not self._is_good(best):
+            return _better(best, other if other.ok else None)
+        return other if other.ok and self._is_good(other) and other.cost < best.cost else best
 
     def _turned(self, row: int, starts: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Starts whose rotation was found on the smallest images of the frame before."""
@@ -582,13 +642,22 @@ class DirectTracker:
                 break
         return found
 
-    def _relocalize(self, row: int) -> Attempt | None:
+    def _relocalize(self, row: int, picture: Picture) -> Attempt | None:
         """At the keyframes whose smallest image fits best under some rotation; nowhere if two places are as likely."""
         first = max(0, len(self.keyframes) - self.config.relocalization_keyframes)
         numbers = list(range(first, len(self.keyframes)))
         scores = self.registrar.rotations(np.array([self._smallest[k] for k in numbers]), row, self._rotations)
         found: list[Attempt] = []
-        for n in np.argsort(scores.min(axis=1), kind="stable")[:4]:
+        order = np.argsort(scores.min(axis=1), kind="stable")
+        witness = self._second.relocalize(picture, [numbers[n] for n in order[:WITNESS_KEYFRAMES]])
+        if witness is not None:
+            near = self._nearest(witness.T_world_camera)
+            overlap = self._overlaps_at(row, witness.T_world_camera)
+            keyframe = max(near, key=lambda k: overlap[k])
+            attempt = self._search(row, keyframe, [witness.T_world_camera], None, None)
+            if attempt is not None:
+                found.append(replace(attempt, moved=np.inf))
+        for n in order[:4]:
             keyframe = numbers[n]
             turn = np.eye(4)
             turn[:3, :3] = self._rotations[scores[n].argmin()].T
@@ -783,6 +852,7 @@ class DirectTracker:
             before=-1 if self._before is None else self._before.index,
             found=np.tile(np.eye(4), (2, 1, 1)) if found is None else np.stack([found.pose, found.motion]),
             confirmed=0 if found is None else found.count,
+            depth_sigma=self._second.depth_sigma,
             typical=(self._typical_scale, self._typical_cost),
         )
 
@@ -797,6 +867,7 @@ class DirectTracker:
         self._reference = state.reference
         if state.confirmed:
             self._found = _Found(state.found[0].copy(), state.found[1].copy(), state.confirmed)
+        self._second.depth_sigma = state.depth_sigma
         self._typical_scale, self._typical_cost = state.typical
         if state.before < 0:
             return
