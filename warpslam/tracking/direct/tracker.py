@@ -575,10 +575,11 @@ class DirectTracker:
         """
         W, points_row = self.keyframes[keyframe].pose, self._points_of(keyframe)
         top, middle = self.plan.top, self.plan.middle
-        tasks = self._task(len(poses))
+        tasks = self._task(2 * len(poses))
         tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, middle
-        tasks["top"], tasks["low"], tasks["iterations"] = top, max(top - 1, 0), 6
-        tasks["T"] = inverse(np.asarray(poses)) @ W
+        tasks["low"], tasks["iterations"] = max(top - 1, 0), 6
+        tasks["top"] = np.repeat([top, max(top - 1, 0)], len(poses))
+        tasks["T"] = np.tile(inverse(np.asarray(poses)) @ W, (2, 1, 1))
         results = self.registrar.register(tasks)
         tried = [(float(r["start_cost"]), t["T"], np.array([1.0, 0.0])) for t, r in zip(tasks, results, strict=True)]
         tried += [(float(r["end_cost"]), r["T"], r["exposure"]) for r in results if r["ok"]]
@@ -593,7 +594,7 @@ class DirectTracker:
             motions = [motion_between(other[1].astype(np.float64), one[1].astype(np.float64)) for other in chosen]
             if all(step >= 0.015 or turn >= 0.7 for step, turn in motions):
                 chosen.append(one)
-            if len(chosen) == 3:
+            if len(chosen) == 6:
                 break
         tasks = self._task(len(chosen))
         tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, 0
