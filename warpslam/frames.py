@@ -67,6 +67,16 @@ class FrameResult:
     message: str = ""
     """Why the frame is not OK."""
 
+    @property
+    def sigma(self) -> tuple[float, float]:
+        """Standard deviation of the pose in the direction that is least certain [m], and of the turn [degrees]; NaN
+        where there is no covariance.
+        """
+        if self.covariance is None:
+            return math.nan, math.nan
+        shift, turn = (float(np.linalg.eigvalsh(self.covariance[k : k + 3, k : k + 3])[-1]) ** 0.5 for k in (0, 3))
+        return shift, math.degrees(turn)
+
 
 @dataclass(frozen=True, eq=False)
 class AdmittedFrame:
