@@ -65,7 +65,8 @@ NEAR_SHIFT = 2.0
 """What moves less against what was foretold [px of the middle level] need not look as much alike."""
 SHIFT_PRICE = 0.02
 """Growth of the cost of a pose by each pixel that it is away from what was foretold."""
-VARIANCE_FACTOR = 100.0
+VARIANCE_FACTOR = 50.0
+"""Of the covariance: on rendered scenes, with noise and without, 90 to 99 % of true errors lie within two sigma."""
 SCRATCH = 0
 """Row of points that hold no keyframe's."""
 
