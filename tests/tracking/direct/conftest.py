@@ -24,9 +24,11 @@ class Bench:
         self.registrar = Registrar(self.plan, 8, 10.0, Floors(2.0, 0.3), device)
         self.pool = ImagePool(CAMERA, device)
 
-    def load(self, row: int, pose: np.ndarray, motion: FrameMotion = NO_MOTION, gain: float = 1.0) -> None:
+    def load(
+        self, row: int, pose: np.ndarray, motion: FrameMotion = NO_MOTION, gain: float = 1.0, room: SweptRoom = ROOM
+    ) -> None:
         """Take the frame at a pose and build its pyramid."""
-        rgb, depth = ROOM.take(CAMERA, pose, motion)
+        rgb, depth = room.take(CAMERA, pose, motion)
         self.pool.set(0, np.rint(rgb * gain).astype(np.uint8), depth)
         images, units, scale = self.pool.arrays
         self.registrar.load(row, images[0], units[0], scale[:1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.kernels.swept_room import SweptRoom
 from tests.tracking.direct.conftest import CAMERA, ROOM
 from warpslam.camera import NO_MOTION, FrameMotion
 from warpslam.kernels.direct import points, registration
@@ -82,11 +83,14 @@ def test_points_lie_on_the_surface_with_its_normals(bench):
 
 
 @pytest.mark.parametrize(("grey", "depth"), [(1.0, 0.0), (0.0, 1.0)])
-def test_gradient_is_that_of_the_cost(pair_of_frames, grey, depth):
+def test_gradient_is_that_of_the_cost(bench, grey, depth):
     """Derivative of the robust cost by the pose, by differences, for each kind of residual alone."""
+    for row, pose in enumerate((START, NEXT)):
+        bench.load(row, pose, room=SweptRoom())
+    bench.registrar.select(0, 1)
     T = inverse(NEXT) @ motion_of(np.array([0.002, -0.001, 0.001, 0.001, 0.001, -0.001]))
     scales = (30.0, 30.0)
-    registrar = pair_of_frames.registrar
+    registrar = bench.registrar
 
     def cost(xi: np.ndarray) -> float:
         return float(registrar.pairs(0, pair(motion_of(xi) @ T, scales), grey, depth)[0]["counts"][0])
@@ -95,7 +99,7 @@ def test_gradient_is_that_of_the_cost(pair_of_frames, grey, depth):
     step = 4e-4
     numeric = [(cost(step * axis) - cost(-step * axis)) / (2 * step) for axis in np.eye(6)]
     # What comes into view and what goes out makes the cost a little rough.
-    assert np.linalg.norm(found["g"][:6] - numeric) < 0.12 * np.linalg.norm(numeric)
+    assert np.linalg.norm(found["g"][:6] - numeric) < 0.06 * np.linalg.norm(numeric)
 
 
 def test_scale_is_the_spread_of_the_residuals(pair_of_frames):
@@ -152,7 +156,7 @@ def test_rotation_is_found_on_the_smallest_image(bench):
 
 @pytest.mark.parametrize("known", [True, False])
 def test_a_moving_camera_is_corrected(bench, known):
-    """Delay of depth and rolling shutter, told: the pose of the middle row to millimetres; untold: several times off."""
+    """Delay of depth and rolling shutter, told: the pose of the middle row to millimetres; untold: much worse."""
     twist = np.array([0.4, 0.1, -0.2, 0.3, 0.5, 0.2])
     motion = FrameMotion(tuple(twist), depth_offset=-0.02, readout=0.026)
     bench.load(0, START)

@@ -128,7 +128,7 @@ def test_delay_and_readout_are_corrected(timed):
     config = Config.from_dict({"mapping": {"enabled": False}, "sensor_timing": timed})
     slam = Slam(CAMERA, config, "cpu", timing=timing)
     twists = [
-        np.array([0.5 * np.sin(0.5 * n), 0.1, 0.3 * np.cos(0.4 * n), 0, 0.6 * np.sin(0.4 * n), 0]) for n in range(24)
+        np.array([0.5 * np.sin(0.15 * n), 0.1, 0.3 * np.cos(0.15 * n), 0, 0.6 * np.sin(0.15 * n), 0]) for n in range(24)
     ]
     pose, path, results = np.eye(4), [], []
     for n, twist in enumerate(twists):

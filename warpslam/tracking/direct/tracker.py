@@ -258,7 +258,7 @@ class DirectTracker:
             if best is None or not self._is_good(best):
                 self._found = None
                 self._keep_before(history)
-                return Located(history.last_pose, _why_lost(best), not history.was_known)
+                return Located(history.last_pose, _why_lost(best))
             pose = self._pose_of(best)
             self._overlap = self._overlaps_at(row, pose)
             done = self._follow(row, best.keyframe, pose, frame, history, best)
@@ -268,7 +268,7 @@ class DirectTracker:
         if not history.was_known:
             why = self._confirm(frame, pose, done.attempt, history)
             if why:
-                return replace(self._located(pose, done, history), why_lost=why)
+                return replace(self._located(pose, done, history), why_lost=why, after_loss=False)
         return self._accept(row, frame, pose, done, history)
 
     def _accept(
@@ -381,7 +381,7 @@ class DirectTracker:
             [self._points_of(k) for k in near],
             inverse(W) @ np.array([self.keyframes[k].pose for k in near]),
         )
-        result, last = started.numpy()[0], final.numpy()[0]
+        result, last = started.numpy()[0].copy(), final.numpy()[0].copy()
         self._overlap = dict(zip(near, shares.numpy()[: len(near)].tolist(), strict=True))
         attempt = replace(self._attempt(reference, result), moved=self._shift(row, task[0]["T"], result["T"]))
         if best is not None:
@@ -873,12 +873,15 @@ class DirectTracker:
         self._typical_scale, self._typical_cost = state.typical
         if state.before < 0:
             return
-        rgb, units, scale = self.images.current()
-        depth = units.astype(np.float32) * np.float32(scale)
-        self._before = _Before(state.before, rgb, depth, (rgb, units, scale))
         if state.before == current:
-            self._upload(state.before, rgb, units, scale)
+            image = self.images.current()
+            self._upload(state.before, *image)
             self._set_motion(state.before, motion)
+        else:  # it became a keyframe when the camera was lost
+            kept = next(one.image for one in self.keyframes if one.index == state.before)
+            image = self.images.kept(kept).unpack(self.camera)
+        rgb, units, scale = image
+        self._before = _Before(state.before, rgb, units.astype(np.float32) * np.float32(scale), image)
 
     # -- motion within a frame -----------------------------------------------------------------------------------
 
