@@ -58,10 +58,24 @@ class FrameResult:
     """Share of the depth rays into what the map has seen that agree with it, in [0, 1]."""
     depth_error: float = 0.0
     """Mean ``|measured - rendered depth|`` of the inliers [m]."""
+    correlation: float | None = None
+    """Of grey values with the keyframe that the frame was registered to, in [-1, 1]; None with other tracking."""
+    covariance: np.ndarray | None = None
+    """Of the pose, float64 (6, 6): T_world_camera is uncertain by exp(xi) on its right, xi = (v, w) [m, rad]."""
     timings: dict[str, float] = field(default_factory=dict)
     """Seconds by phase: "tracking", "mapping" (overlapped: waiting for it and taking it over), "keyframe"."""
     message: str = ""
     """Why the frame is not OK."""
+
+    @property
+    def sigma(self) -> tuple[float, float]:
+        """Standard deviation of the pose in the direction that is least certain [m], and of the turn [degrees]; NaN
+        where there is no covariance.
+        """
+        if self.covariance is None:
+            return math.nan, math.nan
+        shift, turn = (float(np.linalg.eigvalsh(self.covariance[k : k + 3, k : k + 3])[-1]) ** 0.5 for k in (0, 3))
+        return shift, math.degrees(turn)
 
 
 @dataclass(frozen=True, eq=False)

@@ -347,8 +347,10 @@ class Slam:
             account.losses,
             located.inliers,
             located.depth_error,
-            account.seconds,
-            located.why_lost,
+            correlation=located.correlation,
+            covariance=located.covariance,
+            timings=account.seconds,
+            message=located.why_lost,
         )
 
     # -- what came out -------------------------------------------------------------------------------------------

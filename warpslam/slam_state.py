@@ -232,7 +232,13 @@ def _image(fields: StateFields, n: int, scale: float, camera: Intrinsics) -> Com
 def _direct_header(state: DirectState) -> dict[str, Any]:
     # JSON knows no infinity.
     scale, cost = (value if np.isfinite(value) else None for value in state.typical)
-    return {"reference": state.reference, "before": state.before, "scale": scale, "cost": cost}
+    return {
+        "reference": state.reference,
+        "before": state.before,
+        "confirmed": state.confirmed,
+        "scale": scale,
+        "cost": cost,
+    }
 
 
 def _direct(fields: StateFields, frames: int, keyframes: int) -> DirectState | None:
@@ -244,7 +250,8 @@ def _direct(fields: StateFields, frames: int, keyframes: int) -> DirectState | N
     if count > frames or (anchors >= keyframes).any():
         raise fields.damaged("direct_anchors", f"{count} frames of {frames}, keyframes up to {anchors.max(initial=-1)}")
     try:
-        reference, before = int(header["reference"]), int(header["before"])
+        reference, before, confirmed = (int(header[name]) for name in ("reference", "before", "confirmed"))
+        depth_sigma = float(header["depth_sigma"])
         scale, cost = (np.inf if header[name] is None else float(header[name]) for name in ("scale", "cost"))
     except (KeyError, TypeError, ValueError) as error:
         raise fields.damaged("direct", error) from None
@@ -256,6 +263,9 @@ def _direct(fields: StateFields, frames: int, keyframes: int) -> DirectState | N
         overlap=fields.array("direct_overlap", np.float64, (keyframes,)).copy(),
         reference=reference,
         before=before,
+        found=fields.array("direct_found", np.float64, (2, 4, 4)).copy(),
+        confirmed=confirmed,
+        depth_sigma=depth_sigma,
         typical=(scale, cost),
     )
 

@@ -53,6 +53,10 @@ class Located:
     """As in `FrameResult` [m]."""
     loss: float | None = None
     """Mean tracking loss per inlier; None for a pose that was given."""
+    correlation: float | None = None
+    """As in `FrameResult`."""
+    covariance: np.ndarray | None = None
+    """As in `FrameResult`."""
 
     @property
     def status(self) -> FrameStatus:

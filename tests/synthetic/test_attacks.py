@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import Intrinsics, SensorTiming
 from warpslam.errors import ConfigError, InputError
 from warpslam.synthetic import ALTERATIONS, SyntheticSequence, altered
 from warpslam.synthetic.attacks import (
@@ -139,6 +141,24 @@ def test_kinect(base):
     assert (error < 0.7 * step + 5 * (0.0012 + 0.0019 * (z - 0.4) ** 2)).mean() > 0.99
     assert np.median(error / step) > 0.1 and both.mean() < (exact.depth > 0).mean()
     assert 0.5 < np.abs(frame.rgb.astype(float) - exact.rgb).mean() < 3.0
+
+
+def test_times_of_the_sensors_are_those_of_the_base(base):
+    """How far depth is from colour in time stays with the image that is shown, and the camera's timing with it."""
+
+    class Stamped(SyntheticSequence):
+        timing = SensorTiming(depth_delay=-0.02, readout=0.03)
+
+        def __getitem__(self, index):
+            frame = super().__getitem__(index)
+            return replace(frame, depth_timestamp=frame.timestamp + 0.001 * (index + 1))
+
+    stamped = Stamped(0, 20, intrinsics=CAMERA, device="cpu")
+    frozen = freeze(stamped, at=5, count=4)
+    assert frozen.timing == stamped.timing
+    for index, shown in ((4, 4), (7, 5), (9, 9)):
+        assert frozen[index].depth_timestamp == pytest.approx(stamped.timestamp(index) + 0.001 * (shown + 1))
+    assert base[0].depth_timestamp is None and freeze(base)[0].depth_timestamp is None
 
 
 def test_one_after_another(base):

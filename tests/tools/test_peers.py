@@ -92,11 +92,13 @@ def test_judge(folder, tmp_path):
     recording = Recording(folder, "0:8")
     poses = np.array([[0, -1, 0, 5.0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ recording.truth
     write_tum(tmp_path / "trajectory.tum", recording.times[:6], poses[:6])
-    (tmp_path / "run.json").write_text(json.dumps({"lost": [3], "remarks": ["so"], "cpu_seconds": {"tracking": 4.0}}))
-    row = Row("peer")
+    (tmp_path / "run.json").write_text(
+        json.dumps({"lost": [3], "remarks": ["so"], "cpu_seconds": {"tracking": 4.0, "setup": 8.0}})
+    )
+    row = Row("peer", cpu_seconds_a_frame=3.0)
     judge(row, tmp_path, recording)
     assert row.ate_cm < 1e-5 and row.lost == 1 and row.without_pose == 2
-    assert row.tracking_cpu_seconds_a_frame == 0.5 and row.remarks == ["so"]
+    assert row.tracking_cpu_seconds_a_frame == 0.5 and row.cpu_seconds_a_frame == 2.0 and row.remarks == ["so"]
     poses[4, 2, 3] += 0.02
     write_tum(tmp_path / "trajectory.tum", recording.times, poses)
     judge(row, tmp_path, recording)

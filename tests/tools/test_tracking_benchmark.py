@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from tools.benchmarks import tracking
 from tools.benchmarks.tracking import Drive, Figures, drive, false_ok, judge, open_named, table
-from warpslam.camera import Intrinsics
+from warpslam.camera import ONE_MOMENT, Intrinsics
 from warpslam.errors import WarpSlamError
 from warpslam.frames import FrameResult, FrameStatus
 from warpslam.synthetic import SyntheticSequence, write_replica
@@ -35,10 +36,12 @@ class Told:
     def __init__(self, poses: np.ndarray, status: list[FrameStatus], final: np.ndarray) -> None:
         self.poses, self.status, self.final = poses, status, final
         self.given: list[np.ndarray | None] = []
+        self.depth_times: list[float | None] = []
         self.finished = False
 
-    def step(self, rgb, depth, timestamp=None, T_world_camera=None):
+    def step(self, rgb, depth, timestamp=None, T_world_camera=None, *, depth_timestamp=None):
         number = len(self.given)
+        self.depth_times.append(depth_timestamp)
         self.given.append(T_world_camera)
         return FrameResult(number, timestamp, self.poses[number], self.status[number])
 
@@ -113,12 +116,19 @@ def test_figures():
 
 def test_drive_gives_the_first_pose_only():
     """Each frame is stepped once, in order; poses and status come back, the final ones after the end."""
-    sequence = SyntheticSequence(0, 4, intrinsics=SMALL, device="cpu")
+
+    class Stamped(SyntheticSequence):
+        def __getitem__(self, index):
+            frame = super().__getitem__(index)
+            return replace(frame, depth_timestamp=frame.timestamp - 0.01)
+
+    sequence = Stamped(0, 4, intrinsics=SMALL, device="cpu")
     truth = sequence.ground_truth()
     slam = Told(truth, [OK, OK, LOST, OK], truth + 1.0)
     driven = drive(slam, sequence)
     np.testing.assert_array_equal(slam.given[0], truth[0])
     assert slam.given[1:] == [None] * 3
+    np.testing.assert_allclose(slam.depth_times, np.arange(4) / 30 - 0.01)
     np.testing.assert_array_equal(driven.online, truth)
     np.testing.assert_array_equal(driven.final, truth + 1.0)
     assert driven.status == ["OK", "OK", "LOST", "OK"] and len(driven.cpu_seconds) == 4
@@ -150,7 +160,8 @@ def test_command(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(tracking, "CAMERA", SMALL)
     asked = []
 
-    def make(intrinsics, config, device, seed):
+    def make(intrinsics, config, device, seed, *, timing):
+        assert timing == ONE_MOMENT  # as of all that is rendered
         asked.append(config)
         truth = open_named("cabinet@0:5", tmp_path).ground_truth()
         return Told(truth, [OK, OK, OK, LOST, OK], truth)

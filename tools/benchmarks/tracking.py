@@ -47,7 +47,13 @@ class Tracker(Protocol):
     """What of `Slam` is used here."""
 
     def step(
-        self, rgb: Any, depth: Any, timestamp: float | None = None, T_world_camera: np.ndarray | None = None
+        self,
+        rgb: Any,
+        depth: Any,
+        timestamp: float | None = None,
+        T_world_camera: np.ndarray | None = None,
+        *,
+        depth_timestamp: float | None = None,
     ) -> FrameResult:
         """Take in one frame."""
 
@@ -97,14 +103,9 @@ def drive(slam: Tracker, sequence: RgbdSequence) -> Drive:
     online, status, cpu, wall = [], [], [], 0.0
     for index in range(len(sequence)):
         frame = sequence[index]
+        pose = frame.T_world_camera if index == 0 else None
         start, used = time.perf_counter(), time.process_time()
-        result = slam.step(
-            frame.rgb,
-            frame.depth,
-            frame.timestamp,
-            frame.T_world_camera if index == 0 else None,
-            depth_timestamp=frame.depth_timestamp,
-        )
+        result = slam.step(frame.rgb, frame.depth, frame.timestamp, pose, depth_timestamp=frame.depth_timestamp)
         cpu.append(time.process_time() - used)
         wall += time.perf_counter() - start
         online.append(result.T_world_camera)
@@ -155,8 +156,14 @@ def false_ok(poses: np.ndarray, status: Sequence[str], truth: np.ndarray) -> lis
     return now[off].tolist()
 
 
-def open_named(text: str, cache: Path, frames: slice = slice(None)) -> RgbdSequence:
+def open_named(text: str, cache: Path, frames: slice = slice(None), *, published: bool = False) -> RgbdSequence:
     """A sequence by what the command line says of it; a scene that is not in the cache yet is rendered into it.
+
+    Args:
+        text: Folder or scene, "+" what goes wrong, "@" frames.
+        cache: Folder of the scenes.
+        frames: Frames where ``text`` names none.
+        published: Frames of the size that the paper's code takes.
 
     Raises:
         WarpSlamError: There is no such folder, scene, alteration or frame.
@@ -173,6 +180,8 @@ def open_named(text: str, cache: Path, frames: slice = slice(None)) -> RgbdSeque
         sequence.preset = "default"  # Replica's leaves out the borders of its images
     else:
         sequence = open_sequence(base)
+    if published:
+        sequence = sequence.as_published()
     if part:
         frames = parse_frames(part)
     if frames != slice(None):
@@ -212,6 +221,8 @@ def measure(text: str, options: argparse.Namespace) -> Figures:
     if options.optimizer:
         overrides.append(f"tracking.optimizer={options.optimizer}")
     config = Config.from_preset(options.preset or sequence.preset, overrides)
+    if config.published_images:
+        sequence = open_named(text, options.cache, options.frames, published=True)
     slam = Slam(sequence.intrinsics, config, options.device, options.seed, timing=sequence.timing)
     return judge(drive(slam, sequence), truth)
 

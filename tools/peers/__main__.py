@@ -5,7 +5,8 @@ r"""warpslam side by side with other programs on one folder of RGB-D frames, eac
 
 All get the frames of our reader (undistorted, cropped) and are judged alike: ATE RMSE and largest error after rigid
 alignment over the frames that have a pose, those called lost included; lost frames; CPU time a frame of the whole
-process, mesh included, and of tracking alone; with a true surface, the mesh (culled as `warpslam.evaluation` says).
+process, loading and mesh included, and of tracking alone; with a true surface, the mesh, culled as in
+`warpslam.evaluation`.
 Peers are extras: pip install -e ".[peers]". One that is not installed gets a row that says so. Rows marked "cited" are
 figures of the NICE-SLAM paper on other sequences, of programs that need CUDA, or weights that are not to be had.
 """
@@ -96,6 +97,8 @@ def judge(row: Row, out: Path, recording: Recording) -> None:
         record: dict[str, Any] = json.loads((out / "run.json").read_text())
         row.lost, row.remarks = len(record["lost"]), record["remarks"]
         tracking = record["cpu_seconds"].get("tracking")
+        if row.cpu_seconds_a_frame is not None:
+            row.cpu_seconds_a_frame -= record["cpu_seconds"].get("setup", 0.0) / len(recording)
         row.tracking_cpu_seconds_a_frame = None if tracking is None else tracking / len(recording)
     elif (out / "metrics.json").is_file():
         counts = json.loads((out / "metrics.json").read_text())["frames"]

@@ -64,7 +64,8 @@ def orb_slam3(recording: Recording, account: Account, mesh: bool) -> None:
         vocabulary = pyorbslam3.vocabulary_path(download=False)
     except FileNotFoundError:
         vocabulary = str(account.out / "vocabulary.txt")
-        count = make_vocabulary(account.out / "vocabulary.txt", recording)
+        with account.timed("setup"):
+            count = make_vocabulary(account.out / "vocabulary.txt", recording)
         account.remarks.append(f"vocabulary of {count} words made of these images")
     slam = pyorbslam3.Slam(
         vocab_file=vocabulary, settings_file=str(settings), sensor=pyorbslam3.Sensor.RGBD, use_viewer=False

@@ -78,7 +78,7 @@ class Account:
         self.remarks: list[str] = []
         """What should be known beside the figures."""
         self.cpu_seconds: dict[str, float] = {}
-        """Process time by stage."""
+        """Process time by stage: "tracking", "mesh", and "setup", which is not counted against a program."""
 
     def add(self, pose: np.ndarray, ok: bool = True) -> None:
         """The pose of the next frame."""

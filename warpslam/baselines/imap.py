@@ -127,7 +127,7 @@ class Imap(Baseline):
             values,
             located.inliers,
             located.depth_error,
-            timings,
+            timings=timings,
         )
 
     def finish(self) -> dict[str, float]:

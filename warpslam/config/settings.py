@@ -207,6 +207,9 @@ class DirectConfig(_Group):
     )
     lost_agreement: float = Field(0.5, ge=0, le=1, description="share of depth that agrees, for a pose to be believed")
     lost_correlation: float = Field(0.85, ge=-1, le=1, description="correlation of grey values, for the same")
+    near_correlation: float = Field(
+        0.6, ge=-1, le=1, description="the same where the pose is the one that constant speed foretold"
+    )
     lost_view: float = Field(0.15, ge=0, le=1, description="share of the keyframe in view, for the same")
     lost_known: float = Field(0.08, ge=0, le=1, description="share of it where both have depth, for the same")
     search_span: float = Field(24.0, gt=0, le=60, description="rotations searched, up to this [degrees]")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import os
 import platform
 from collections import defaultdict
@@ -78,7 +79,10 @@ def write_frames(folder: RunFolder, record: RunRecord) -> None:
     write_json(folder.frame_records, record.to_rows())
     with open(folder.frames, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["frame", "timestamp", "status", "inliers", "depth_error_m", "message"])
+        columns = ["inliers", "depth_error_m", "correlation", "sigma_m", "sigma_deg"]
+        writer.writerow(["frame", "timestamp", "status", *columns, "message"])
         for index, result in record.frames:
-            figures = (f"{result.inliers:.4f}", f"{result.depth_error:.5f}")
+            figures = [f"{result.inliers:.4f}", f"{result.depth_error:.5f}"]
+            figures.append("" if result.correlation is None else f"{result.correlation:.4f}")
+            figures += ["" if math.isnan(value) else f"{value:.6f}" for value in result.sigma]
             writer.writerow([index, f"{result.timestamp:.6f}", result.status, *figures, result.message])

@@ -193,9 +193,30 @@ def _tracking_charts(run: RunData, x: np.ndarray, marks: Sequence[tuple[int, str
         "Inliers over time", x, [("estimate", "inliers", inliers)],
         x_label="time [s]", y_label="inliers [%]", marks=marks, top=105.0,
     )  # fmt: skip
-    caption = "Share of the depth rays into what the map has seen that agree with it."
+    caption = "Share of the depth that agrees with what is expected at the pose: the keyframe's, or the map's."
     content.append(element("figure", chart, element("figcaption", caption)))
+    if any(result.correlation is not None for result in run.record.results):
+        content += _certainty_charts(run, x, marks)
     return element("div", content, class_="pair")
+
+
+def _certainty_charts(run: RunData, x: np.ndarray, marks: Sequence[tuple[int, str, str]]) -> list[Html]:
+    """How alike the frames are to their keyframes, and how far the estimated poses may be off."""
+    results = run.record.results
+    correlation = np.array([np.nan if one.correlation is None else one.correlation for one in results])
+    sigma = np.array([1000 * one.sigma[0] for one in results])
+    likeness = charts.time_chart(
+        "Correlation over time", x, [("estimate", "correlation", correlation)],
+        x_label="time [s]", y_label="correlation of grey values", marks=marks, top=1.05,
+    )  # fmt: skip
+    spread = charts.time_chart(
+        "Uncertainty over time", x, [("estimate", "sigma", sigma)],
+        x_label="time [s]", y_label="standard deviation [mm]", marks=marks,
+    )  # fmt: skip
+    return [
+        element("figure", likeness, element("figcaption", "Grey values of a frame and of its keyframe.")),
+        element("figure", spread, element("figcaption", "Of the position, in the direction that is least certain.")),
+    ]
 
 
 def images_section(run: RunData) -> Html:

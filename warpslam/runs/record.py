@@ -23,7 +23,7 @@ FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
 """How a run ended. After ctrl-C everything up to then is written."""
 
 # Beside its number in the sequence; the other fields of a result are in timing.json and trajectory.tum.
-_ROW_FIELDS = ("timestamp", "status", "message", "inliers", "depth_error", "losses")
+_ROW_FIELDS = ("timestamp", "status", "message", "inliers", "depth_error", "correlation", "covariance", "losses")
 # A report says what a file has, even if that is no status of ours.
 _STATUSES = {str(status): status for status in FrameStatus}
 
@@ -139,7 +139,8 @@ class RunRecord:
     def to_rows(self) -> dict[str, Any]:
         """Content of frames.json: what became of each frame."""
         rows = [
-            {"index": index, **{name: getattr(result, name) for name in _ROW_FIELDS}} for index, result in self.frames
+            {"index": index, **{name: _plain(getattr(result, name)) for name in _ROW_FIELDS}}
+            for index, result in self.frames
         ]
         return {"frames": rows, "left_out": [vars(frame) for frame in self.left_out]}
 
@@ -160,9 +161,10 @@ class RunRecord:
         record = cls(left_out=[LeftOut(**frame) for frame in content["left_out"]])
         truth = np.full((len(poses), 4, 4), np.nan) if truth is None else truth
         for position, (row, pose, true_pose) in enumerate(zip(content["frames"], poses, truth, strict=True)):
-            # Early files have no depth error.
-            row = {"depth_error": None, **row}
+            # Early files have not all of them.
+            row = {"depth_error": None, "correlation": None, "covariance": None, **row}
             values = {name: _known(row[name]) for name in _ROW_FIELDS}
+            values |= {"correlation": row["correlation"], "covariance": _matrix(row["covariance"])}
             values["status"] = _STATUSES.get(row["status"], row["status"])
             values["losses"] = {name: _known(value) for name, value in row["losses"].items()}
             record.add(row["index"], true_pose, FrameResult(index=position, T_world_camera=pose, **values))
@@ -178,7 +180,7 @@ class RunRecord:
             "first_index": self.first_index,
             "digests": list(self.digests.items()),
             "results": [
-                {f.name: getattr(result, f.name) for f in fields(FrameResult) if f.name != "T_world_camera"}
+                {f.name: _plain(getattr(result, f.name)) for f in fields(FrameResult) if f.name != "T_world_camera"}
                 for result in self.results
             ],
         }
@@ -200,7 +202,10 @@ class RunRecord:
             frame_indices=[int(index) for index in header["frame_indices"]],
             truth_poses=list(truth.reshape(-1, 4, 4)),
             results=[
-                FrameResult(T_world_camera=pose, **{**row, "status": FrameStatus(row["status"])})
+                FrameResult(
+                    T_world_camera=pose,
+                    **{**row, "status": FrameStatus(row["status"]), "covariance": _matrix(row["covariance"])},
+                )
                 for pose, row in zip(poses, header["results"], strict=True)
             ],
             left_out=[LeftOut(int(frame["index"]), str(frame["message"])) for frame in header["left_out"]],
@@ -255,3 +260,18 @@ class RunResult:
 
     reconstruction: ReconstructionResult | None
     """Surface errors; None without a true surface or a mesh."""
+
+
+def _plain(value: Any) -> Any:
+    """A field as JSON takes it."""
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _matrix(rows: Any) -> np.ndarray | None:
+    """A covariance (6, 6) from its rows; None where there is none."""
+    if rows is None:
+        return None
+    matrix = np.array(rows, np.float64)
+    if matrix.shape != (6, 6):
+        raise ValueError(f"a covariance has shape {matrix.shape}, expected (6, 6)")
+    return matrix

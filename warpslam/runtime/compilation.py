@@ -29,11 +29,13 @@ _STAGES = (
     "kernels.grid",
     "views",
     "direct",
+    "features",
 )
 _PYTHON_MODULES = {
     "warpslam.rays": ("pixels", "rays", "rejection", "samples"),
-    "warpslam.direct": ("direct.images", "direct.points", "direct.registration"),
     "warpslam.views": ("frustum", "images", "rectify", "seen", "visibility"),
+    "warpslam.direct": ("direct.images", "direct.points", "direct.registration"),
+    "warpslam.features": ("features.matching", "features.pose", "features.agreement"),
     **{f"warpslam.decoder_{target}": ("decoder.build",) for target in ("cpu", "cuda")},
     **{f"warpslam.imap_{target}": ("imap_network",) for target in ("cpu", "cuda")},
 }

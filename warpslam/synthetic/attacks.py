@@ -57,6 +57,7 @@ class AlteredSequence(RgbdSequence):
         self.name = f"{base.name}+{name}"
         self.intrinsics = base.intrinsics
         self.preset = base.preset
+        self.timing = base.timing
         self.mesh = getattr(base, "mesh", None)
         self.warp_modules = getattr(base, "warp_modules", ())
         self.images = np.arange(len(base)) if images is None else np.asarray(images)
@@ -79,7 +80,9 @@ class AlteredSequence(RgbdSequence):
             pose = None if truth is None else truth[place].copy()
         if self._change is not None:
             rgb, depth = self._change(index, rgb, depth)
-        return Frame(index, self.timestamp(index), rgb, depth.astype(np.float32, copy=False), pose)
+        time, own = self.timestamp(index), frame.depth_timestamp
+        depth_time = None if own is None else time + own - frame.timestamp
+        return Frame(index, time, rgb, depth.astype(np.float32, copy=False), pose, depth_time)
 
     def timestamp(self, index: int) -> float:
         """Time of a frame [s]."""

@@ -55,9 +55,11 @@ STOP = wp.constant(1.0e-4)
 """Shift [m] and turn [rad] of a step after which a level of unit size is done."""
 COST_GREY_SCALE = wp.constant(12.0)
 COST_DEPTH_SCALE = wp.constant(8.0)
-OUT_OF_VIEW = wp.constant(1.0)
+OUT_OF_VIEW = wp.constant(0.3)
 """Cost of a point that is not in view: a higher one draws to poses that see all."""
 
+FIRST_WIDTH = wp.constant(20.0)
+ANNEALING = wp.constant(0.6)
 START_COST = wp.constant(0)
 SCALE = wp.constant(1)
 STEP = wp.constant(2)
@@ -214,6 +216,7 @@ def register(
     exposure = task.exposure
     n = task.top
     done = int(0)
+    width = float(0.0)
     phase = int(SCALE)
     if task.cost_level >= 0:
         phase = START_COST
@@ -238,7 +241,8 @@ def register(
             if task.iterations == -2:
                 phase = DONE
         elif phase == SCALE:
-            weights = scaled(weights, sums.counts, bins, floors.grey, floors.depth)
+            width = FIRST_WIDTH
+            weights = scaled(weights, sums.counts, bins, width, floors.depth)
             done = 0
             phase = STEP
             if task.iterations < 0:
@@ -251,12 +255,13 @@ def register(
                 x = damped_step(sums.H, sums.g, exposure)
                 T = moved(T, x)
                 exposure = exposed(exposure, x)
-                weights = scaled(weights, sums.counts, bins, floors.grey, floors.depth)
+                width = wp.max(floors.grey, width * ANNEALING)
+                weights = scaled(weights, sums.counts, bins, width, floors.depth)
                 done += 1
                 limit = task.iterations
                 if limit == 0:
                     limit = iterations[n]
-                if done >= limit or is_still(x, n):
+                if done >= limit or (is_still(x, n) and width <= floors.grey):
                     if n == task.low or n < _RECORDS:
                         phase = RECORD
                     else:

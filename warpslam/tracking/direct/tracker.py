@@ -28,7 +28,9 @@ from warpslam.scene.keyframes import Keyframe
 from warpslam.tracking.direct.measures import Measures
 from warpslam.tracking.direct.pyramid import PyramidPlan, records
 from warpslam.tracking.direct.registrar import Floors, Registrar, new_tasks
+from warpslam.tracking.direct.second import Picture, SecondWitness
 from warpslam.tracking.direct.window import Pose, refine_window
+from warpslam.tracking.features.witness import Witness
 from warpslam.trajectory import TWIST_STEPS, FrameHistory, Located
 
 RECENT = 4
@@ -43,6 +45,28 @@ DEGREE = 0.02
 """Metres that a degree counts for when keyframes are ordered by nearness."""
 MAX_JOINT_STEP, MAX_JOINT_TURN = 0.1, 5.0
 """Further than this [m], [degrees] the joint registration must not take a pose."""
+MAX_GAP = 10
+"""Frames after which a camera that was lost may be anywhere."""
+MAX_MOTION = 0.3, 30.0
+"""A frame [m], [degrees]; more is believed where the last steps were nearly as long."""
+FOUND_AGREEMENT, FOUND_CORRELATION, FOUND_KNOWN = 0.75, 0.9, 0.25
+"""What a place found again must reach."""
+CONFIRMATIONS = 3
+"""Frames that must follow before a place found again is believed."""
+UNIQUE = 1.5
+"""Another place that costs less than this multiple of the best is as likely."""
+WITNESS_KEYFRAMES = 5
+"""Keyframes whose features a frame is matched with."""
+DIFFERENT_STEP, DIFFERENT_TURN = 0.03, 1.5
+"""Two answers that are further apart [m], [degrees] contradict each other."""
+DECISIVE = 0.7
+"""Another pose than the one foretold must cost less than this multiple of what that one costs."""
+NEAR_SHIFT = 2.0
+"""What moves less against what was foretold [px of the middle level] need not look as much alike."""
+SHIFT_PRICE = 0.02
+"""Growth of the cost of a pose by each pixel that it is away from what was foretold."""
+VARIANCE_FACTOR = 50.0
+"""Of the covariance: on rendered scenes, with noise and without, 90 to 99 % of true errors lie within two sigma."""
 SCRATCH = 0
 """Row of points that hold no keyframe's."""
 
@@ -64,6 +88,8 @@ class Attempt:
     grey_scale: float
     """Spread of the photometric residuals [grey values]."""
     ok: bool = True
+    back: Measures | None = None
+    """The keyframe in the frame's points, the other way round."""
     moved: float = 0.0
     """How far the image moved from the start [px of the middle level]."""
 
@@ -77,6 +103,38 @@ class _Anchor:
 
 
 @dataclass(frozen=True)
+class Followed:
+    """A frame registered to all keyframes of large overlap."""
+
+    attempt: Attempt
+    """Its registration to the reference."""
+    T_frame_reference: np.ndarray
+    """float64 (4, 4)."""
+    seen: Measures
+    """How well it fits the reference at the largest level."""
+    depth_error: float
+    """Spread of depth against the reference [m]."""
+    covariance: np.ndarray
+    """Of the pose, as a twist (v, w) in the frame's axes [m, rad], float64 (6, 6)."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A place that was found after a loss and is not confirmed yet."""
+
+    pose: np.ndarray
+    motion: np.ndarray
+    """Since the frame before."""
+    count: int
+    """Frames that agree."""
+
+    @property
+    def starts(self) -> list[np.ndarray]:
+        """Where the camera may be in the next frame."""
+        return [self.pose @ self.motion, self.pose]
+
+
+@dataclass(frozen=True)
 class _Before:
     """The last frame that was OK, as it may yet become a keyframe."""
 
@@ -85,6 +143,14 @@ class _Before:
     depth: np.ndarray
     kept: tuple[np.ndarray, np.ndarray, float] | None
     """Its images as the pool held them; None where they are on a GPU."""
+
+    @property
+    def picture(self) -> Picture:
+        """The frame as it comes back from a file."""
+        if self.kept is None:
+            return Picture(self.rgb, self.depth)
+        rgb, units, scale = self.kept
+        return Picture(rgb, units.astype(np.float32) * np.float32(scale))
 
 
 @dataclass(frozen=True)
@@ -101,6 +167,12 @@ class DirectState:
     """Keyframe that frames are registered to."""
     before: int
     """The last frame that was OK, -1 = none."""
+    found: np.ndarray
+    """A place that is not confirmed yet: its pose and the motion there, float64 (2, 4, 4)."""
+    confirmed: int
+    """Frames that agree with it; 0 = there is no such place."""
+    depth_sigma: float
+    """What the second witness has learnt of depth [1/m]."""
     typical: tuple[float, float]
     """Running means of the photometric scale and of the cost; infinite = none yet."""
 
@@ -146,7 +218,9 @@ class DirectTracker:
         self._typical_scale = np.inf
         self._typical_cost = np.inf
         self._before: _Before | None = None
+        self._found: _Found | None = None
         self._rotations = rotation_grid(config.search_span)
+        self._second = SecondWitness(camera, device, max_depth, keyframes, images)
         self.counts = {"sure": 0, "searched": 0}
 
     # -- what Slam asks ------------------------------------------------------------------------------------------
@@ -164,67 +238,98 @@ class DirectTracker:
         self._build_missing()
         row = self._load(frame)
         self._foretell_motion(frame, history)
-        starts = history.starts(constant_speed=True)
         if not self.keyframes:
             return Located(np.eye(4), "it is not known where the camera starts: there is no keyframe to compare with")
-        best: Attempt | None = None
-        done: tuple[Attempt, np.ndarray, np.ndarray] | None = None
         if history.was_known:
+            self._found = None
+        found = self._found
+        starts = history.starts(constant_speed=True) if found is None else found.starts
+        best: Attempt | None = None
+        done: Followed | None = None
+        if history.was_known or found is not None:
             done = self._follow(row, self._reference, starts[0], frame, history)
-            if self._is_sure(done[0]):
+            if self._is_sure(done.attempt):
                 self.counts["sure"] += 1
             else:
-                best, done = done[0], None
+                best, done = done.attempt, None
         if done is None:
             self.counts["searched"] += 1
             best = self._look_everywhere(row, frame, history, starts, best)
             if best is None or not self._is_good(best):
-                self._settle(frame, None)
+                self._found = None
                 self._keep_before(history)
                 return Located(history.last_pose, _why_lost(best), not history.was_known)
             pose = self._pose_of(best)
             self._overlap = self._overlaps_at(row, pose)
             done = self._follow(row, best.keyframe, pose, frame, history, best)
-        attempt, T_frame_reference, H = done
-        self._typical_scale = (
-            attempt.grey_scale
-            if not np.isfinite(self._typical_scale)
-            else 0.9 * self._typical_scale + 0.1 * attempt.grey_scale
-        )
-        self._typical_cost = (
-            attempt.cost if not np.isfinite(self._typical_cost) else 0.9 * self._typical_cost + 0.1 * attempt.cost
-        )
-        self._reference = attempt.keyframe
+        self.note = done
+        self._reference = done.attempt.keyframe
+        pose = orthonormalized(self.keyframes[self._reference].pose @ inverse(done.T_frame_reference))
+        if not history.was_known:
+            why = self._confirm(frame, pose, done.attempt, history)
+            if why:
+                return replace(self._located(pose, done, history), why_lost=why)
+        return self._accept(row, frame, pose, done, history)
+
+    def _accept(
+        self, row: int, frame: AdmittedFrame, pose: np.ndarray, done: Followed, history: FrameHistory
+    ) -> Located:
+        """Hang a frame whose pose is believed on its keyframe, and make it one if it should be."""
+        attempt = done.attempt
         reference = self.keyframes[attempt.keyframe]
-        pose = orthonormalized(reference.pose @ inverse(T_frame_reference))
-        self._settle(frame, _Anchor(attempt.keyframe, inverse(reference.pose) @ pose))
+        self._typical_scale = _running(self._typical_scale, attempt.grey_scale)
+        self._typical_cost = _running(self._typical_cost, attempt.cost)
+        anchor = self._anchors[frame.index] = _Anchor(attempt.keyframe, inverse(reference.pose) @ pose)
         self._note_motion(frame, pose, history)
-        anchor = self._anchors[frame.index]
-        assert anchor is not None
+        anchor = self._anchors[frame.index] or anchor
         pose = reference.pose @ anchor.T_keyframe_frame
-        after_loss = not history.was_known
-        measures = attempt.measures
-        located = Located(
-            pose,
-            after_loss=after_loss,
-            inliers=measures.agreement,
-            loss=attempt.cost,
-        )
         self._note(frame)
-        if self._is_new(row, pose, attempt):
+        if self._is_new(pose, done):
             old = self._revisited(row, pose, attempt.keyframe)
             if old is not None:
                 self._reference = old
             else:
                 self._add_keyframe(frame.index, pose, self.images.keep_current())
                 self._refine(history)
-                located = Located(
-                    self.keyframes[-1].pose.copy(),
-                    after_loss=after_loss,
-                    inliers=measures.agreement,
-                    loss=attempt.cost,
-                )
-        return located
+                pose = self.keyframes[-1].pose.copy()
+        return self._located(pose, done, history)
+
+    def _located(self, pose: np.ndarray, done: Followed, history: FrameHistory) -> Located:
+        measures = done.attempt.measures
+        return Located(
+            pose,
+            after_loss=not history.was_known,
+            inliers=measures.agreement,
+            depth_error=done.depth_error,
+            loss=done.attempt.cost,
+            correlation=measures.correlation,
+            covariance=done.covariance,
+        )
+
+    def _confirm(self, frame: AdmittedFrame, pose: np.ndarray, attempt: Attempt, history: FrameHistory) -> str:
+        """Why a pose that was found after a loss can't be believed yet; empty if it can.
+
+        One that is near where the camera was lost a moment ago needs no more than any other. Elsewhere the place must
+        look as it did, both ways, and the frames that follow must go on from there.
+        """
+        last = history.last_known
+        gap = MAX_GAP + 1 if last is None else len(history) - last
+        if gap <= MAX_GAP and not history.is_jump(pose, *MAX_MOTION):
+            return ""
+        m, back = attempt.measures, attempt.back
+        alike = back is None or min(m.agreement, back.agreement) > FOUND_AGREEMENT
+        usual = attempt.grey_scale < 2.0 * max(self._typical_scale, 4.0)
+        if not (alike and usual and m.correlation > FOUND_CORRELATION and m.known > FOUND_KNOWN):
+            self._found = None
+            return f"a place was found that may be another one: {_why_lost(attempt)}"
+        before, count = (None, 0) if self._found is None else (self._found.pose, self._found.count)
+        count += 1
+        if count > CONFIRMATIONS:
+            self._found = None
+            return ""
+        motion = np.eye(4) if before is None else inverse(before) @ pose
+        self._found = _Found(pose, motion, count)
+        return f"found again, to be confirmed by the frames that follow ({count} of {CONFIRMATIONS})"
 
     # -- registration --------------------------------------------------------------------------------------------
 
@@ -246,13 +351,10 @@ class DirectTracker:
         frame: AdmittedFrame,
         history: FrameHistory,
         best: Attempt | None = None,
-    ) -> tuple[Attempt, np.ndarray, np.ndarray]:
+    ) -> Followed:
         """Register to the reference from a pose, then to all keyframes of large overlap; one reading of the device.
 
         best: What the pose comes from: only the largest level is left to do.
-
-        Returns:
-            The attempt, the pose as T_frame_reference, and the normal matrix (6, 6) of the pose.
         """
         W = self.keyframes[reference].pose
         task = self._task()
@@ -288,8 +390,30 @@ class DirectTracker:
         step, turn = motion_between(T_joint, T)
         if step > MAX_JOINT_STEP or turn > MAX_JOINT_TURN:
             T_joint = T
-        self._seen = Measures.of(result["record_0"])
-        return attempt, T_joint, np.asarray(last["H"], np.float64)
+        attempt = replace(attempt, back=self._measure_back(row, reference, T_joint))
+        seen = Measures.of(result["record_0"])
+        sigma = depth_sigma(self.registrar.mean_depth(row))
+        return Followed(
+            attempt,
+            T_joint,
+            seen,
+            float(result["record_0"][eq.DEPTH_SCALE]) * sigma,
+            covariance_of(np.asarray(last["H"], np.float64)),
+        )
+
+    def _measure_back(self, row: int, keyframe: int, T_frame_keyframe: np.ndarray) -> Measures:
+        """How well a keyframe fits the points of a frame."""
+        level = self.plan.middle
+        self.registrar.select(row, SCRATCH, level)
+        pair = records(registration.Pair)
+        pair["keyframe"], pair["row"], pair["T"] = (
+            SCRATCH,
+            self._row(self.keyframes[keyframe]),
+            inverse(T_frame_keyframe),
+        )
+        pair["exposure"] = (1.0, 0.0)
+        found = self.registrar.pairs(level, pair, self.config.grey_weight, self.config.depth_weight)[0]
+        return Measures.of(found["counts"])
 
     def _shift(self, row: int, a: np.ndarray, b: np.ndarray) -> float:
         """How far two transforms put points apart, about [px of the middle level]."""
@@ -299,12 +423,14 @@ class DirectTracker:
 
     def _attempt(self, keyframe: int, result: np.ndarray) -> Attempt:
         record = result["record_1"] if self.judged == 1 else result["record_0"]
+        # Thin lines are lost on small images, and on large ones what is a little blurred does not fit.
+        measures, finest = Measures.of(record), Measures.of(result["record_0"])
         return Attempt(
             keyframe,
             np.asarray(result["T"], np.float64),
             np.asarray(result["exposure"], np.float64),
             float(result["end_cost"]),
-            Measures.of(record),
+            replace(measures, correlation=max(measures.correlation, finest.correlation)),
             float(record[eq.GREY_SCALE]),
             bool(result["ok"]) and bool(np.isfinite(result["T"]).all()),
         )
@@ -327,10 +453,11 @@ class DirectTracker:
     def _is_good(self, attempt: Attempt) -> bool:
         """Whether the pose can be believed."""
         m, config = attempt.measures, self.config
+        is_near = attempt.moved < NEAR_SHIFT and m.agreement > config.sure_agreement
         return (
             attempt.ok
             and m.agreement > config.lost_agreement
-            and m.correlation > config.lost_correlation
+            and m.correlation > (config.near_correlation if is_near else config.lost_correlation)
             and m.view > config.lost_view
             and m.known > config.lost_known
         )
@@ -346,20 +473,60 @@ class DirectTracker:
         best: Attempt | None,
     ) -> Attempt | None:
         """At the reference, at the frame before, at older keyframes, until a pose is believed."""
-        last = history.last_known
-        if last is not None:
+        picture = self._picture(frame)
+        if history.last_known is not None or self._found is not None:
+            witness = self._ask(picture, history, starts[0])
             poses = [*starts, *self._turned(row, starts)]
-            found = self._search(row, self._points_of(self._reference), self._reference, poses, best)
-            best = _better(best, found, by_cost=True)
+            found = self._search(row, self._reference, poses, starts[0], None)
+            if best is None or not self._is_good(best) or best.moved > NEAR_SHIFT:
+                best = _better(best, found, by_cost=True)
+            elif found is not None and self._is_good(found) and found.cost < DECISIVE * best.cost:
+                best = found
+            best = self._judge(row, best, witness)
             if best is not None and self._is_good(best):
                 return best
-            if history.was_known and self._before is not None and self._before.index != self._reference_frame:
+            before = self._before
+            if history.was_known and before is not None and before.index != self._reference_frame:
                 self._keep_before(history)
-                found = self._search(row, self._points_of(self._reference), self._reference, poses, None)
-                best = _better(best, found)
+                best = _better(best, self._search(row, self._reference, poses, starts[0], None))
+                best = self._judge(row, best, witness)
                 if best is not None and self._is_good(best):
                     return best
-        return _better(best, self._relocalize(row))
+        return _better(best, self._relocalize(row, picture))
+
+    def _picture(self, frame: AdmittedFrame) -> Picture:
+        """The frame as it comes back from a file."""
+        if not self.device.is_cpu:
+            return Picture(frame.rgb, frame.depth)
+        rgb, units, scale = self.images.current()
+        return Picture(rgb, units.astype(np.float32) * np.float32(scale))
+
+    def _ask(self, picture: Picture, history: FrameHistory, foretold: np.ndarray) -> Witness | None:
+        """What features say, if the frame follows one whose pose is known."""
+        before = self._before
+        if before is None or not history.was_known:
+            return None
+        likely = sorted(self._overlap.items(), key=lambda item: -item[1])
+        keyframes = list(dict.fromkeys([self._reference, *(k for k, _ in likely)]))[:WITNESS_KEYFRAMES]
+        return self._second.locate(picture, before.picture, history.last_pose, foretold, keyframes)
+
+    def _judge(self, row: int, best: Attempt | None, witness: Witness | None) -> Attempt | None:
+        """Where features say something else, a third measure decides: which of both answers the images fit better."""
+        if witness is None:
+            return best
+        if best is not None:
+            step, turn = motion_between(self._pose_of(best), witness.T_world_camera)
+            if step < DIFFERENT_STEP and turn < DIFFERENT_TURN:
+                return best
+        task = self._task()
+        task["keyframe"], task["row"], task["cost_level"] = self._points_of(self._reference), row, 0
+        task["top"] = self.judged
+        task["T"] = inverse(witness.T_world_camera) @ self.keyframes[self._reference].pose
+        other = self._attempt(self._reference, self.registrar.register(task)[0])
+        other = replace(other, moved=self._shift(row, task[0]["T"], other.T_frame_keyframe))
+        if best is None or not self._is_good(best):
+            return _better(best, other if other.ok else None)
+        return other if other.ok and self._is_good(other) and other.cost < best.cost else best
 
     def _turned(self, row: int, starts: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Starts whose rotation was found on the smallest images of the frame before."""
@@ -396,15 +563,24 @@ class DirectTracker:
         return out
 
     def _search(
-        self, row: int, points_row: int, keyframe: int, poses: Sequence[np.ndarray], best: Attempt | None
+        self,
+        row: int,
+        keyframe: int,
+        poses: Sequence[np.ndarray],
+        foretold: np.ndarray | None,
+        best: Attempt | None,
     ) -> Attempt | None:
-        """The cheapest of many starts: each as it is and after the smallest levels, the best three refined."""
-        W = self.keyframes[keyframe].pose
+        """The cheapest of many starts: each as it is and after the smallest levels, the best three refined.
+
+        foretold: Pose that counts as likely: where all looks alike, the nearest to it is chosen.
+        """
+        W, points_row = self.keyframes[keyframe].pose, self._points_of(keyframe)
         top, middle = self.plan.top, self.plan.middle
-        tasks = self._task(len(poses))
+        tasks = self._task(2 * len(poses))
         tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, middle
-        tasks["top"], tasks["low"], tasks["iterations"] = top, max(top - 1, 0), 6
-        tasks["T"] = inverse(np.asarray(poses)) @ W
+        tasks["low"], tasks["iterations"] = max(top - 1, 0), 6
+        tasks["top"] = np.repeat([top, max(top - 1, 0)], len(poses))
+        tasks["T"] = np.tile(inverse(np.asarray(poses)) @ W, (2, 1, 1))
         results = self.registrar.register(tasks)
         tried = [(float(r["start_cost"]), t["T"], np.array([1.0, 0.0])) for t, r in zip(tasks, results, strict=True)]
         tried += [(float(r["end_cost"]), r["T"], r["exposure"]) for r in results if r["ok"]]
@@ -419,7 +595,7 @@ class DirectTracker:
             motions = [motion_between(other[1].astype(np.float64), one[1].astype(np.float64)) for other in chosen]
             if all(step >= 0.015 or turn >= 0.7 for step, turn in motions):
                 chosen.append(one)
-            if len(chosen) == 3:
+            if len(chosen) == 6:
                 break
         tasks = self._task(len(chosen))
         tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, 0
@@ -428,6 +604,9 @@ class DirectTracker:
             task["T"], task["exposure"] = T, exposure
         for result in self.registrar.register(tasks):
             found = self._attempt(keyframe, result)
+            if foretold is not None:
+                moved = self._shift(row, inverse(foretold) @ W, result["T"])
+                found = replace(found, moved=moved, cost=found.cost * (1.0 + SHIFT_PRICE * moved))
             if found.ok:
                 best = _better(best, found, by_cost=True)
         return best
@@ -465,28 +644,46 @@ class DirectTracker:
                 break
         return found
 
-    def _relocalize(self, row: int) -> Attempt | None:
-        """At the keyframes whose smallest image fits best under some rotation."""
+    def _relocalize(self, row: int, picture: Picture) -> Attempt | None:
+        """At the keyframes whose smallest image fits best under some rotation; nowhere if two places are as likely."""
         first = max(0, len(self.keyframes) - self.config.relocalization_keyframes)
         numbers = list(range(first, len(self.keyframes)))
         scores = self.registrar.rotations(np.array([self._smallest[k] for k in numbers]), row, self._rotations)
-        best: Attempt | None = None
-        for n in np.argsort(scores.min(axis=1), kind="stable")[:4]:
+        found: list[Attempt] = []
+        order = np.argsort(scores.min(axis=1), kind="stable")
+        witness = self._second.relocalize(picture, [numbers[n] for n in order[:WITNESS_KEYFRAMES]])
+        if witness is not None:
+            near = self._nearest(witness.T_world_camera)
+            overlap = self._overlaps_at(row, witness.T_world_camera)
+            keyframe = max(near, key=lambda k: overlap[k])
+            attempt = self._search(row, keyframe, [witness.T_world_camera], None, None)
+            if attempt is not None:
+                found.append(replace(attempt, moved=np.inf))
+        for n in order[:4]:
             keyframe = numbers[n]
             turn = np.eye(4)
             turn[:3, :3] = self._rotations[scores[n].argmin()].T
-            pose = self.keyframes[keyframe].pose @ turn
-            best = _better(best, self._search(row, self._points_of(keyframe), keyframe, [pose], None))
+            attempt = self._search(row, keyframe, [self.keyframes[keyframe].pose @ turn], None, None)
+            if attempt is not None:
+                found.append(replace(attempt, moved=np.inf))
+        best = max(found, key=lambda attempt: attempt.measures.worth, default=None)
+        if best is None or not self._is_good(best):
+            return best
+        for other in found:
+            step, turn_angle = motion_between(self._pose_of(best), self._pose_of(other))
+            is_elsewhere = step > MAX_JOINT_STEP or turn_angle > MAX_JOINT_TURN
+            if is_elsewhere and self._is_good(other) and other.cost < UNIQUE * best.cost:
+                return replace(best, ok=False)
         return best
 
     # -- keyframes -----------------------------------------------------------------------------------------------
 
-    def _is_new(self, row: int, pose: np.ndarray, attempt: Attempt) -> bool:
+    def _is_new(self, pose: np.ndarray, done: Followed) -> bool:
         """Whether a frame sees so much else that it should be a keyframe."""
-        config, k = self.config, attempt.keyframe
+        config, k = self.config, done.attempt.keyframe
         step, turn = motion_between(self.keyframes[k].pose, pose)
         return (
-            self._seen.view * self._seen.agreement < config.keyframe_overlap
+            done.seen.view * done.seen.agreement < config.keyframe_overlap
             or step > config.keyframe_step * self._mean_depth[k]
             or turn > config.keyframe_turn
         )
@@ -638,9 +835,6 @@ class DirectTracker:
         self._row_of[index] = row
         return row
 
-    def _settle(self, frame: AdmittedFrame, anchor: _Anchor | None) -> None:
-        self._anchors[frame.index] = anchor
-
     def _note(self, frame: AdmittedFrame) -> None:
         kept = self.images.current() if self.device.is_cpu else None
         self._before = _Before(frame.index, frame.rgb if kept else frame.rgb.copy(), frame.depth, kept)
@@ -649,6 +843,7 @@ class DirectTracker:
 
     def state(self) -> DirectState:
         """All of it as arrays."""
+        found = self._found
         anchors = [-1 if anchor is None else anchor.keyframe for anchor in self._anchors]
         relative = [np.eye(4) if anchor is None else anchor.T_keyframe_frame for anchor in self._anchors]
         return DirectState(
@@ -657,6 +852,9 @@ class DirectTracker:
             overlap=np.array([self._overlap.get(k, np.nan) for k in range(len(self.keyframes))], np.float64),
             reference=self._reference,
             before=-1 if self._before is None else self._before.index,
+            found=np.tile(np.eye(4), (2, 1, 1)) if found is None else np.stack([found.pose, found.motion]),
+            confirmed=0 if found is None else found.count,
+            depth_sigma=self._second.depth_sigma,
             typical=(self._typical_scale, self._typical_cost),
         )
 
@@ -669,6 +867,9 @@ class DirectTracker:
         self._anchors = [None if k < 0 else _Anchor(k, T.copy()) for k, T in pairs]
         self._overlap = {k: share for k, share in enumerate(state.overlap.tolist()) if np.isfinite(share)}
         self._reference = state.reference
+        if state.confirmed:
+            self._found = _Found(state.found[0].copy(), state.found[1].copy(), state.confirmed)
+        self._second.depth_sigma = state.depth_sigma
         self._typical_scale, self._typical_cost = state.typical
         if state.before < 0:
             return
@@ -765,6 +966,25 @@ def _better(a: Attempt | None, b: Attempt | None, *, by_cost: bool = False) -> A
     if by_cost:
         return b if b.cost < a.cost else a
     return b if b.measures.worth > a.measures.worth else a
+
+
+def _running(mean: float, value: float) -> float:
+    return value if not np.isfinite(mean) else 0.9 * mean + 0.1 * value
+
+
+def depth_sigma(z: float) -> float:
+    """Standard deviation of a structured-light sensor's depth at a distance [m], [m]."""
+    return float(0.0012 + 0.0019 * (z - 0.4) ** 2)
+
+
+def covariance_of(H: np.ndarray) -> np.ndarray:
+    """Covariance (6, 6) of a pose, as a twist (v, w) [m, rad], from its normal matrix.
+
+    Residuals of one image err together, by far more than their number suggests: `VARIANCE_FACTOR` takes up what the
+    true errors are beyond what the matrix says.
+    """
+    H = np.where(np.isfinite(H), H, 0.0)
+    return VARIANCE_FACTOR * np.linalg.inv(0.5 * (H + H.T) + np.diag([1e-2] * 3 + [1e-2] * 3))
 
 
 def _why_lost(best: Attempt | None) -> str:
