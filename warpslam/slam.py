@@ -270,8 +270,8 @@ class Slam:
 
     @property
     def _has_begun(self) -> bool:
-        """Whether there is something to track by."""
-        return not self.scene.is_empty if self.direct is None else bool(self.keyframes)
+        """Whether there is something to track by, or a map whose axes count."""
+        return not self.scene.is_empty or (self.direct is not None and bool(self.keyframes))
 
     def _motion(self, frame: AdmittedFrame) -> FrameMotion:
         """How the camera moved while it took a frame, as far as is known by now."""

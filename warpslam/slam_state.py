@@ -236,6 +236,7 @@ def _direct_header(state: DirectState) -> dict[str, Any]:
         "reference": state.reference,
         "before": state.before,
         "confirmed": state.confirmed,
+        "depth_sigma": state.depth_sigma,
         "scale": scale,
         "cost": cost,
     }
