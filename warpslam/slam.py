@@ -230,7 +230,7 @@ class Slam:
             config=config,
             depth_timestamp=depth_timestamp if config.sensor_timing else None,
             timing=self._timing,
-            colored=config.tracking.color_weight > 0 or config.mapping.color_weight > 0,
+            colored=self.direct is not None or max(config.tracking.color_weight, config.mapping.color_weight) > 0,
         )
 
     def _is_due(self, frame: AdmittedFrame) -> bool:
