@@ -112,7 +112,7 @@ class Registrar:
     def smallest(self, row: int) -> np.ndarray:
         """Grey values of the smallest level, float32 (pixels,)."""
         first = int(self.plan.levels[-1]["first"])
-        return np.asarray(self._images.grey[row].numpy()[first:])
+        return np.array(self._images.grey[row].numpy()[first:])
 
     def mean_depth(self, row: int) -> float:
         """Of the smallest level [m]; 1 where nothing has depth."""
@@ -125,7 +125,7 @@ class Registrar:
 
     def register(self, tasks: np.ndarray) -> np.ndarray:
         """Run `registration.Task`s side by side; one `registration.Result` each."""
-        return np.asarray(self.start(tasks).numpy()[: len(tasks)])
+        return np.array(self.start(tasks).numpy()[: len(tasks)])
 
     def start(self, tasks: np.ndarray) -> wp.array:
         """`register` without waiting; what it returns holds until the next call."""
@@ -214,7 +214,7 @@ class Registrar:
         identity = records(registration.Result)
         identity["T"] = np.eye(4)
         still.assign(identity)
-        return np.asarray(self.overlaps(row, still, keyframes, T_frame_keyframe).numpy()[: len(keyframes)])
+        return np.array(self.overlaps(row, still, keyframes, T_frame_keyframe).numpy()[: len(keyframes)])
 
     def pairs(self, level: int, pairs: np.ndarray, grey: float, depth: float) -> np.ndarray:
         """Normal equations of `registration.Pair`s at a level, one `registration.PairSums` each."""
@@ -243,7 +243,7 @@ class Registrar:
             return [(registration.sum_pairs, (stop - first) * self.lanes, inputs)]
 
         self._launcher.slices(count, steps, whole=count == 1)
-        return np.asarray(sums.numpy()[:count])
+        return np.array(sums.numpy()[:count])
 
     def rotations(self, smallest: np.ndarray, row: int, candidates: np.ndarray) -> np.ndarray:
         """1 - correlation of the smallest images under each rotation (n, 3, 3), of each of ``smallest`` (k, pixels)
@@ -257,7 +257,7 @@ class Registrar:
         scores = self._array("scores", wp.float32, len(smallest), len(candidates))
         inputs = [self._levels, keys, self._images, row, known, scores]
         self._launcher.launch(registration.search_rotations, (len(smallest), len(candidates)), inputs)
-        return np.asarray(scores.numpy()[: len(smallest)])
+        return np.array(scores.numpy()[: len(smallest)])
 
     # -- memory --------------------------------------------------------------------------------------------------
 

@@ -65,7 +65,8 @@ NEAR_SHIFT = 2.0
 """What moves less against what was foretold [px of the middle level] need not look as much alike."""
 SHIFT_PRICE = 0.02
 """Growth of the cost of a pose by each pixel that it is away from what was foretold."""
-VARIANCE_FACTOR = 100.0
+VARIANCE_FACTOR = 50.0
+"""Of the covariance: on rendered scenes, with noise and without, 90 to 99 % of true errors lie within two sigma."""
 SCRATCH = 0
 """Row of points that hold no keyframe's."""
 
@@ -272,7 +273,7 @@ class DirectTracker:
         if not history.was_known:
             why = self._confirm(frame, pose, done.attempt, history)
             if why:
-                return replace(self._located(pose, done, history), why_lost=why)
+                return replace(self._located(pose, done, history), why_lost=why, after_loss=False)
         return self._accept(row, frame, pose, done, history)
 
     def _accept(
@@ -303,7 +304,6 @@ class DirectTracker:
         return Located(
             history.last_pose,
             why,
-            after_loss=not history.was_known,
             inliers=0.0 if best is None else best.measures.agreement,
             depth_error=np.inf if best is None else self._depth_error(row, best),
             correlation=None if best is None else best.measures.correlation,
@@ -396,7 +396,7 @@ class DirectTracker:
             [self._points_of(k) for k in near],
             inverse(W) @ np.array([self.keyframes[k].pose for k in near]),
         )
-        result, last = started.numpy()[0], final.numpy()[0]
+        result, last = started.numpy()[0].copy(), final.numpy()[0].copy()
         self._overlap = dict(zip(near, shares.numpy()[: len(near)].tolist(), strict=True))
         attempt = replace(self._attempt(reference, result), moved=self._shift(row, task[0]["T"], result["T"]))
         if best is not None:
