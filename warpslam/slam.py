@@ -230,7 +230,7 @@ class Slam:
             config=config,
             depth_timestamp=depth_timestamp if config.sensor_timing else None,
             timing=self._timing,
-            colored=config.tracking.color_weight > 0 or config.mapping.color_weight > 0,
+            colored=self.direct is not None or max(config.tracking.color_weight, config.mapping.color_weight) > 0,
         )
 
     def _is_due(self, frame: AdmittedFrame) -> bool:
@@ -270,8 +270,8 @@ class Slam:
 
     @property
     def _has_begun(self) -> bool:
-        """Whether there is something to track by."""
-        return not self.scene.is_empty if self.direct is None else bool(self.keyframes)
+        """Whether there is something to track by, or a map whose axes count."""
+        return not self.scene.is_empty or (self.direct is not None and bool(self.keyframes))
 
     def _motion(self, frame: AdmittedFrame) -> FrameMotion:
         """How the camera moved while it took a frame, as far as is known by now."""

@@ -53,7 +53,8 @@ def test_every_setting_is_explained_within_80_columns(capsys, monkeypatch):
         group, _, name = setting.name.rpartition(".")
         assert f"\n{name} " in out and f"\n{group}" in out
     assert "window 5 frames optimised together" in words
-    assert "optimizer gauss_newton Adam" in words and "(adam or gauss_newton)" in words and "(1 to 64)" in words
+    assert "optimizer direct direct registration" in words and "(1 to 64)" in words
+    assert "(direct or adam or gauss_newton)" in words
 
 
 def test_settings_as_json(capsys):

@@ -30,7 +30,7 @@ SETTINGS = [
     "tracking.lost_depth_error=10", "tracking.lost_inliers=0", "tracking.max_step=10", "tracking.max_turn=180",
     "mapping.pixels=60", "mapping.every=2", "mapping.first_iterations=10", "mapping.iterations=5",
     "mapping.coarse_iterations=1", "mapping.refinement_rounds=1", "mapping.bundle_adjustment_keyframes=2",
-    "keyframes.every=2", "meshing.voxel=0.1",
+    "keyframes.every=2", "meshing.voxel=0.1", "direct.keyframe_overlap=0.999",
 ]  # fmt: skip
 SAME = ("trajectory.tum", "mesh.ply", "map.safetensors", "frames.csv")
 

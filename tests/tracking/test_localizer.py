@@ -11,6 +11,7 @@ from warpslam.field.decoder_files import load_decoders
 from warpslam.poses import motion_between, pose_from_vector
 from warpslam.slam import Slam
 from warpslam.synthetic import SyntheticSequence
+from warpslam.tracking.direct.tracker import DirectTracker
 from warpslam.tracking.localizer import Localizer
 from warpslam.tracking.thumbnail import Thumbnail
 from warpslam.trajectory import FrameHistory, Located
@@ -38,10 +39,17 @@ def sequence() -> SyntheticSequence:
     return SyntheticSequence(0, 400, intrinsics=CAMERA)
 
 
+@pytest.fixture(scope="module", params=["gauss_newton", "direct"])
+def optimizer(request) -> str:
+    """Tracking against renders, and against keyframes."""
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def saved(sequence, tmp_path_factory):
+def saved(sequence, optimizer, tmp_path_factory):
     """A map of the first frames, in a file."""
-    slam = Slam(CAMERA, Config.from_preset("default", SETTINGS), "cpu", decoders=load_decoders())
+    settings = [*SETTINGS, f"tracking.optimizer={optimizer}"]
+    slam = Slam(CAMERA, Config.from_preset("default", settings), "cpu", decoders=load_decoders())
     for n in range(BEFORE):
         frame = sequence[STRIDE * n]
         result = slam.step(frame.rgb, frame.depth, frame.timestamp, frame.T_world_camera if n == 0 else None)
@@ -68,8 +76,10 @@ def test_camera_is_found_again_after_a_gap(sequence, saved):
         assert error(result, frame) < 0.03
 
 
-def test_camera_stays_lost_without_the_keyframe_search(sequence, saved):
+def test_camera_stays_lost_without_the_keyframe_search(sequence, saved, optimizer):
     """The same gap, keyframes left alone: the frame is lost, keeps the last pose, and the map is untouched."""
+    if optimizer == "direct":
+        pytest.skip("direct tracking always searches")
     slam = Slam.load(saved, "cpu")
     slam.config.tracking.relocalization = False
     features = slam.scene.grids["middle"].features.numpy().copy()
@@ -94,17 +104,21 @@ def test_unknown_ground_is_no_place_to_be_found_at(sequence, saved):
     assert slam.trajectory.status[-3:] == ["LOST", "LOST", "OK"]
 
 
-def test_localize_only_leaves_the_map_alone(sequence, saved):
-    """The first pose is found against the keyframes without any hint, later ones are tracked, and nothing of the map
-    changes.
+def test_localize_only_leaves_the_map_alone(sequence, saved, optimizer):
+    """The first pose is found against the keyframes without any hint (direct tracking believes it after three frames
+    more), later ones are tracked, and nothing of the map changes.
     """
+    confirmed = BACK_AT + (3 if optimizer == "direct" else 0)
     slam = Slam.load(saved, "cpu", localize_only=True)
     before = {level: grid.features.numpy().copy() for level, grid in slam.scene.grids.items()}
     keyframes, bounds = len(slam.keyframes), [side.copy() for side in slam.scene.bounds]
-    for n in range(BACK_AT, BACK_AT + 4):
+    for n in range(BACK_AT, BACK_AT + 6):
         frame = sequence[n]
         result = slam.step(frame.rgb, frame.depth, frame.timestamp)
-        assert result.status == "OK" and error(result, frame) < 0.03
+        if n < confirmed:
+            assert result.status == "LOST" and "to be confirmed" in result.message
+        else:
+            assert result.status == "OK" and error(result, frame) < 0.03
     assert slam.finish() == {}
     for level, grid in slam.scene.grids.items():
         np.testing.assert_array_equal(grid.features.numpy(), before[level])
@@ -115,7 +129,8 @@ def test_localize_only_leaves_the_map_alone(sequence, saved):
 def test_localize_only_takes_a_given_first_pose(sequence, saved, monkeypatch):
     """A pose that comes with the first frame is taken, and nothing is searched."""
     slam = Slam.load(saved, "cpu", localize_only=True)
-    monkeypatch.setattr(Localizer, "_likely", lambda *arguments: pytest.fail("the keyframes were searched"))
+    for tracker, search in ((Localizer, "_likely"), (DirectTracker, "_relocalize")):
+        monkeypatch.setattr(tracker, search, lambda *arguments: pytest.fail("the keyframes were searched"))
     for n in (BACK_AT, BACK_AT + 1):
         frame = sequence[n]
         result = slam.step(frame.rgb, frame.depth, frame.timestamp, frame.T_world_camera if n == BACK_AT else None)

@@ -16,7 +16,7 @@ from warpslam.synthetic import SyntheticSequence
 
 
 def main(frame_count: int = 14, *, settings: Sequence[str] = SETTINGS) -> float:
-    """Map, save, load, and localize every third frame backwards; returns the largest error of position [m]."""
+    """Map, save, load, and localize the frames backwards; returns the largest error of a position that is OK [m]."""
     sequence = SyntheticSequence(room_seed=0, frame_count=frame_count, intrinsics=CAMERA)
     slam = warpslam.Slam(CAMERA, warpslam.Config.from_preset("default", list(settings)))
     for frame in sequence:
@@ -28,12 +28,15 @@ def main(frame_count: int = 14, *, settings: Sequence[str] = SETTINGS) -> float:
         slam.save(path)
         localizer = warpslam.Slam.load(path, localize_only=True)
     errors = []
-    for number in range(frame_count - 1, -1, -3):
+    for number in range(frame_count - 1, -1, -1):
         result = localizer.step(sequence[number].rgb, sequence[number].depth)
+        if result.status == "LOST":  # a place that was found is believed when a few frames have confirmed it
+            print(f"frame {number}: LOST, {result.message}")
+            continue
         error = np.linalg.norm(result.T_world_camera[:3, 3] - sequence.ground_truth()[number, :3, 3])
         errors.append(float(error))
         print(f"frame {number}: {result.status}, {100 * error:.1f} cm off")
-    return max(errors)
+    return max(errors, default=np.inf)
 
 
 if __name__ == "__main__":

@@ -62,8 +62,10 @@ class PyramidPlan:
 
     @property
     def middle(self) -> int:
-        """Where registration begins if the motion can be foretold."""
-        return max(self.top - 2, 0)
+        """Where registration begins if the motion can be foretold: two levels below the smallest, but no further down
+        than level 1, where poses are judged, if there is one.
+        """
+        return max(self.top - 2, min(1, self.top))
 
     @property
     def pixels(self) -> int:

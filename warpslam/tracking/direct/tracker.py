@@ -87,6 +87,8 @@ class Attempt:
     """At the level where poses are judged."""
     grey_scale: float
     """Spread of the photometric residuals [grey values]."""
+    depth_scale: float
+    """Spread of the geometric residuals at the largest level [sigma of depth]."""
     ok: bool = True
     back: Measures | None = None
     """The keyframe in the frame's points, the other way round."""
@@ -162,7 +164,7 @@ class DirectState:
     relative: np.ndarray
     """T_keyframe_frame, float64 (N, 4, 4)."""
     overlap: np.ndarray
-    """Share of each keyframe that the last frame sees, float64 (keyframes,); NaN = not looked at."""
+    """Share of each keyframe that the last frame sees, float64 (keyframes,); -1 = not looked at."""
     reference: int
     """Keyframe that frames are registered to."""
     before: int
@@ -239,9 +241,12 @@ class DirectTracker:
         row = self._load(frame)
         self._foretell_motion(frame, history)
         if not self.keyframes:
-            return Located(np.eye(4), "it is not known where the camera starts: there is no keyframe to compare with")
+            why = "it is not known where the camera starts: there is no keyframe to compare with"
+            return self._lost(row, None, why, history)
         if history.was_known:
             self._found = None
+        elif history.last_known is None and not self._has_kept_before:
+            self._before = None  # the pose was forgotten: nothing tells where that frame is from here
         found = self._found
         starts = history.starts(constant_speed=True) if found is None else found.starts
         best: Attempt | None = None
@@ -258,7 +263,7 @@ class DirectTracker:
             if best is None or not self._is_good(best):
                 self._found = None
                 self._keep_before(history)
-                return Located(history.last_pose, _why_lost(best))
+                return self._lost(row, best, _why_lost(best), history)
             pose = self._pose_of(best)
             self._overlap = self._overlaps_at(row, pose)
             done = self._follow(row, best.keyframe, pose, frame, history, best)
@@ -293,6 +298,16 @@ class DirectTracker:
                 self._refine(history)
                 pose = self.keyframes[-1].pose.copy()
         return self._located(pose, done, history)
+
+    def _lost(self, row: int, best: Attempt | None, why: str, history: FrameHistory) -> Located:
+        """A frame whose pose is not known; ``best``: the best that was found, if anything was."""
+        return Located(
+            history.last_pose,
+            why,
+            inliers=0.0 if best is None else best.measures.agreement,
+            depth_error=np.inf if best is None else self._depth_error(row, best),
+            correlation=None if best is None else best.measures.correlation,
+        )
 
     def _located(self, pose: np.ndarray, done: Followed, history: FrameHistory) -> Located:
         measures = done.attempt.measures
@@ -392,12 +407,11 @@ class DirectTracker:
             T_joint = T
         attempt = replace(attempt, back=self._measure_back(row, reference, T_joint))
         seen = Measures.of(result["record_0"])
-        sigma = depth_sigma(self.registrar.mean_depth(row))
         return Followed(
             attempt,
             T_joint,
             seen,
-            float(result["record_0"][eq.DEPTH_SCALE]) * sigma,
+            self._depth_error(row, attempt),
             covariance_of(np.asarray(last["H"], np.float64)),
         )
 
@@ -432,8 +446,13 @@ class DirectTracker:
             float(result["end_cost"]),
             replace(measures, correlation=max(measures.correlation, finest.correlation)),
             float(record[eq.GREY_SCALE]),
+            float(result["record_0"][eq.DEPTH_SCALE]),
             bool(result["ok"]) and bool(np.isfinite(result["T"]).all()),
         )
+
+    def _depth_error(self, row: int, attempt: Attempt) -> float:
+        """Spread of depth against the keyframe [m]."""
+        return attempt.depth_scale * depth_sigma(self.registrar.mean_depth(row))
 
     def _is_sure(self, attempt: Attempt) -> bool:
         """Whether nothing needs to be searched for."""
@@ -723,10 +742,15 @@ class DirectTracker:
     def _keep_before(self, history: FrameHistory) -> None:
         """The last frame that was OK becomes a keyframe: it is what a lost camera is nearest to."""
         before = self._before
-        if before is None or self._row_before() is None or before.index in (one.index for one in self.keyframes):
+        if before is None or self._row_before() is None or self._has_kept_before:
             return
         image = self.images.add(before.rgb, before.depth) if before.kept is None else self.images.add_kept(*before.kept)
         self._add_keyframe(before.index, history.pose(before.index), image)
+
+    @property
+    def _has_kept_before(self) -> bool:
+        """Whether the last frame that was OK is a keyframe already."""
+        return self._before is not None and any(one.index == self._before.index for one in self.keyframes)
 
     def _row_before(self) -> int | None:
         """Where the images of the last frame that was OK are; None if they are gone."""
@@ -849,7 +873,7 @@ class DirectTracker:
         return DirectState(
             anchors=np.array(anchors, np.int64),
             relative=np.array(relative, np.float64).reshape(-1, 4, 4),
-            overlap=np.array([self._overlap.get(k, np.nan) for k in range(len(self.keyframes))], np.float64),
+            overlap=np.array([self._overlap.get(k, -1.0) for k in range(len(self.keyframes))], np.float64),
             reference=self._reference,
             before=-1 if self._before is None else self._before.index,
             found=np.tile(np.eye(4), (2, 1, 1)) if found is None else np.stack([found.pose, found.motion]),
@@ -865,23 +889,26 @@ class DirectTracker:
         """
         pairs = zip(state.anchors.tolist(), state.relative, strict=True)
         self._anchors = [None if k < 0 else _Anchor(k, T.copy()) for k, T in pairs]
-        self._overlap = {k: share for k, share in enumerate(state.overlap.tolist()) if np.isfinite(share)}
+        self._overlap = {k: share for k, share in enumerate(state.overlap.tolist()) if share >= 0}
         self._reference = state.reference
         if state.confirmed:
             self._found = _Found(state.found[0].copy(), state.found[1].copy(), state.confirmed)
         self._second.depth_sigma = state.depth_sigma
         self._typical_scale, self._typical_cost = state.typical
+        self._build_missing()  # first, lest it displace the frame before
         if state.before < 0:
             return
+        keyframe = next((one for one in reversed(self.keyframes) if one.index == state.before), None)
         if state.before == current:
-            image = self.images.current()
-            self._upload(state.before, *image)
+            rgb, units, scale = self.images.current()
+            self._upload(state.before, rgb, units, scale)
             self._set_motion(state.before, motion)
-        else:  # it became a keyframe when the camera was lost
-            kept = next(one.image for one in self.keyframes if one.index == state.before)
-            image = self.images.kept(kept).unpack(self.camera)
-        rgb, units, scale = image
-        self._before = _Before(state.before, rgb, units.astype(np.float32) * np.float32(scale), image)
+        elif keyframe is not None:
+            rgb, units, scale = self.images.kept(keyframe.image).unpack(self.camera)
+        else:
+            return
+        depth = units.astype(np.float32) * np.float32(scale)
+        self._before = _Before(state.before, rgb, depth, (rgb, units, scale))
 
     # -- motion within a frame -----------------------------------------------------------------------------------
 
