@@ -183,11 +183,14 @@ def evaluate(
     exposure: wp.vec2,
     weights: Weights,
     gate: float,
+    stride: int,
     lane: int,
     lanes: int,
     bins: wp.array[int],
 ) -> Sums:
-    """Normal equations of a pair at one level; ``bins`` gets the histograms of the residuals."""
+    """Normal equations of a pair at one level, over every ``stride``-th point; ``bins`` gets the histograms of the
+    residuals.
+    """
     H = Triangle()
     g = Vec8()
     counts = Vec16()
@@ -195,7 +198,7 @@ def evaluate(
     for k in range(lane, 2 * _BINS, lanes):
         bins[k] = 0
     group_wait()
-    for k in range(level.first_point + lane, level.first_point + level.points, lanes):
+    for k in range(level.first_point + stride * lane, level.first_point + level.points, stride * lanes):
         X = points.position[keyframe, k]
         if X[2] <= 0.0:
             continue
