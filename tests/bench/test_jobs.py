@@ -44,7 +44,18 @@ def test_names_and_hashes_are_stable(write_suite, tmp_path):
         job.settings_hash for job in jobs if "tracking.use_given_poses=true" in job.request.overrides
     ]
     assert len({job.name for job in jobs}) == len(jobs)
-    assert "room-nice-slam-0a6b87d3-seed3" in {job.name for job in jobs}
+    assert {"room-nice-slam-4821d7cf-seed3", "room-nice-slam-32c6019c-seed3"} < {job.name for job in jobs}
+
+
+def test_studies_of_tracking_by_rendering_track_so(write_suite, tmp_path):
+    """By Gauss-Newton where the settings say direct; a preset that says Adam, given poses and iMAP stay as they are."""
+    for preset, expected in (("default", ("tracking.optimizer=gauss_newton",)), ("paper_replica", ())):
+        sequences = {"room": {"path": "data/room", "preset": preset}}
+        studies = ("tracking", "color", "tracking_iterations", "frame_loss", "dynamic", "levels")
+        for entry in expand(read_suite(str(write_suite(*studies, sequences=sequences))), tmp_path):
+            chosen = tuple(one for one in entry.job.request.overrides if one.startswith("tracking.optimizer"))
+            is_of_rendering = entry.study.name not in ("tracking", "levels") and entry.variant.method == "nice-slam"
+            assert chosen == (expected if is_of_rendering else ())
 
 
 def test_studies_share_runs(write_suite, tmp_path):

@@ -13,6 +13,7 @@ from warpslam.batch.jobs import Job
 from warpslam.bench.studies import Study, Variant
 from warpslam.bench.suite import Rendering, SequenceSpec, StudySpec, Suite
 from warpslam.camera import Intrinsics
+from warpslam.config import Config
 from warpslam.runs.folder import as_file_name
 from warpslam.runs.request import ALL_FRAMES, RunRequest, Source, parse_slice
 from warpslam.storage.json_files import read_json, write_json
@@ -84,6 +85,8 @@ def _job(
     poses = suite.resolve(sequence.poses) if study.given_poses else None
     if study.given_poses and poses is None:
         overrides.append("tracking.use_given_poses=true")
+    if study.by_rendering and variant.method == "nice-slam":
+        overrides += _by_rendering(sequence.preset, overrides)
     frames = spec.frames or sequence.frames
     request = RunRequest(
         source=Source(path, sequence.dataset, sequence.camera),
@@ -98,6 +101,12 @@ def _job(
         truth_mesh=truth_mesh if study.needs_truth_mesh else None,
     )
     return Job(as_file_name(f"{name}-{variant.method}-{_digest(request)}-seed{seed}"), request)
+
+
+def _by_rendering(preset: str, overrides: list[str]) -> list[str]:
+    """What has a camera tracked against renders of the map."""
+    is_direct = Config.from_preset(preset, overrides).tracking.optimizer == "direct"
+    return ["tracking.optimizer=gauss_newton"] if is_direct else []
 
 
 def _last_values(overrides: list[str]) -> tuple[str, ...]:
