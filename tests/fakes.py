@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import trimesh
 from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.errors import DatasetError, MeshError
+from warpslam.frames import FrameResult, FrameStatus
 from warpslam.pipeline import run as pipeline
 from warpslam.poses import pose_from_vector
 from warpslam.runs.record import RunResult
@@ -58,19 +59,6 @@ class FakeSequence(RgbdSequence):
 
 
 @dataclass
-class FakeResult:
-    index: int
-    timestamp: float
-    T_world_camera: np.ndarray
-    status: str = "OK"
-    losses: dict[str, float] = field(default_factory=lambda: {"loss": 1.5})
-    inliers: float = 0.9
-    depth_error: float = 0.02
-    timings: dict[str, float] = field(default_factory=lambda: {"tracking": 0.25, "mapping": 0.5})
-    message: str = ""
-
-
-@dataclass
 class FakeTrajectory:
     timestamps: np.ndarray
     poses: np.ndarray
@@ -98,11 +86,11 @@ class FakeSlam:
 
     def __init__(self, intrinsics: Intrinsics, **settings: object) -> None:
         self.settings = settings
-        self.results: list[FakeResult] = []
+        self.results: list[FrameResult] = []
         self.given: list[np.ndarray | None] = []
         self.finished = False
 
-    def step(self, rgb, depth, timestamp=None, T_world_camera=None, *, depth_timestamp=None) -> FakeResult:
+    def step(self, rgb, depth, timestamp=None, T_world_camera=None, *, depth_timestamp=None) -> FrameResult:
         index = len(self.results)
         if index == self.interrupt_at:
             raise KeyboardInterrupt
@@ -112,7 +100,10 @@ class FakeSlam:
         self.given.append(T_world_camera)
         T = np.array(true_pose(round(timestamp * 30)))
         T[0, 3] += 0.01 * (index % 2)
-        self.results.append(FakeResult(index, timestamp, T, "LOST" if index == self.lost_at else "OK"))
+        status = FrameStatus.LOST if index == self.lost_at else FrameStatus.OK
+        timings = {"tracking": 0.25, "mapping": 0.5}
+        result = FrameResult(index, timestamp, T, status, {"loss": 1.5}, 0.9, 0.02, correlation=0.95, timings=timings)
+        self.results.append(result)
         return self.results[-1]
 
     def finish(self) -> dict[str, float]:

@@ -61,6 +61,8 @@ class SlamState:
     """The last frame that was mapped, if there is one."""
     direct: DirectState | None = None
     """What direct tracking goes on from."""
+    digest: int | None = None
+    """By which the images of the last frame are known again."""
 
 
 def write_slam(path: Path, state: SlamState) -> None:
@@ -107,6 +109,7 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
         "timing": vars(state.timing),
         "current": state.current,
         "mapped": state.mapped,
+        "digest": state.digest,
         "first": state.history.first,
         "keyframes": [keyframe.index for keyframe, _ in state.keyframes],
         "seen": [seen.index for seen in state.seen],
@@ -198,6 +201,7 @@ def state_from_arrays(
         current=fields.frame("current", count),
         mapped=fields.frame("mapped", count),
         direct=_direct(fields, count, len(frames)),
+        digest=fields.header.get("digest"),
     )
 
 
@@ -266,6 +270,7 @@ def _direct(fields: StateFields, frames: int, keyframes: int) -> DirectState | N
         before=before,
         found=fields.array("direct_found", np.float64, (2, 4, 4)).copy(),
         confirmed=confirmed,
+        motion=fields.array("direct_motion", np.float64, (8,)).copy(),
         depth_sigma=depth_sigma,
         typical=(scale, cost),
     )

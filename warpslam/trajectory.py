@@ -198,14 +198,17 @@ class FrameHistory:
         """Whether the pose of the very last frame is known."""
         return self.last_known is not None and self.last_known == len(self) - 1
 
-    def starts(self, constant_speed: bool) -> list[np.ndarray]:
-        """Where the camera may be now, most likely first: constant speed (if on and known), and the last known pose."""
+    def starts(self, constant_speed: bool, bridge: int = 0) -> list[np.ndarray]:
+        """Where the camera may be now, most likely first: constant speed (if on and known), and the last known pose.
+
+        bridge: Frames without a pose over which constant speed is still believed.
+        """
         last = self.last_known
         if last is None:
             return []
-        T = self._poses[last]
-        if constant_speed and last == len(self) - 1 and self.follows(last):
-            return [T @ self._motion, T]
+        T, gap = self._poses[last], len(self) - 1 - last
+        if constant_speed and gap <= bridge and self.follows(last):
+            return [T @ np.linalg.matrix_power(self._motion, 1 + gap) if gap else T @ self._motion, T]
         return [T]
 
     def twist(self, steps: int = TWIST_STEPS) -> np.ndarray:

@@ -189,6 +189,16 @@ def test_no_mesh_is_reported_not_fatal(fake_slam, tmp_path):
     assert not result.folder.mesh.exists() and result.folder.panels.exists()
 
 
+def test_without_mapping_there_is_a_trajectory_alone(fake_slam, tmp_path):
+    """No mesh and no panels are tried, and the figures say why; frames.csv has what is known of each pose."""
+    config = Config.from_dict({"mapping": {"enabled": False}})
+    folder = run_sequence(FakeSequence(4), config, tmp_path / "run").folder
+    assert not folder.mesh.exists() and not folder.panels.exists() and folder.trajectory.exists()
+    assert metrics_of(folder.path)["mesh"] == {"error": "mapping.enabled is off"}
+    header = folder.frames.read_text().splitlines()[0]
+    assert header == "frame,timestamp,status,inliers,depth_error_m,correlation,sigma_m,sigma_deg,message"
+
+
 def test_without_ground_truth(fake_slam, tmp_path):
     """No truth: no ATE, no truth file, and the plots are still drawn."""
     result = run_sequence(FakeSequence(4, no_truth=tuple(range(4))), Config(), tmp_path)

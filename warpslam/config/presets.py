@@ -6,7 +6,7 @@ from typing import Any
 
 # "paper_*" hold the released configurations (rotation_rate_factor 0.2 = "separate rates") with the paper's optimiser.
 # The others are
-# ours: Gauss-Newton tracking, and work cut to what two CPU cores do in minutes; BENCHMARK.md has what they reach.
+# ours: direct tracking, and work cut to what two CPU cores do in minutes; BENCHMARK.md has what they reach.
 _PAPER: dict[str, Any] = {"optimizer": "adam", "final_rate_factor": 1.0, "seen_only": False}
 
 

@@ -95,10 +95,11 @@ def test_a_place_found_again_is_confirmed_first():
     track(slam, path)
     for seed in range(12):
         assert slam.step(*dark_room(seed)).status is FrameStatus.LOST
-    back = track(slam, [path[-1]] * 5)
+    again = [path[-1] @ motion_of(1e-3 * n * np.ones(6)) for n in range(5)]
+    back = track(slam, again)
     assert [result.status for result in back] == [FrameStatus.LOST] * 3 + [FrameStatus.OK] * 2
     assert "confirmed" in back[0].message
-    assert errors(back[3:], [path[-1]] * 2)[:, 0].max() < 5e-3
+    assert errors(back[3:], again[3:])[:, 0].max() < 5e-3
 
 
 def test_fast_turns_are_found():
@@ -119,6 +120,17 @@ def test_a_camera_that_stands_still_does_not_move():
         assert result.status is FrameStatus.OK
         assert np.linalg.norm(result.T_world_camera[:3, 3]) < 1e-3
     assert len(slam.keyframes) == 1
+
+
+def test_a_frozen_image_is_nothing_new():
+    """The same image to the bit is skipped; the next one is tracked as if nothing had been."""
+    slam, path = tracker(), poses(5)
+    track(slam, path[:3])
+    frozen = slam.step(*take(path[2]))
+    assert frozen.status is FrameStatus.SKIPPED and "to the bit" in frozen.message
+    after = track(slam, path[3:])
+    assert {result.status for result in after} == {FrameStatus.OK}
+    assert errors(after, path[3:])[:, 0].max() < 5e-3
 
 
 @pytest.mark.parametrize("timed", [True, False])

@@ -45,6 +45,8 @@ DEGREE = 0.02
 """Metres that a degree counts for when keyframes are ordered by nearness."""
 MAX_JOINT_STEP, MAX_JOINT_TURN = 0.1, 5.0
 """Further than this [m], [degrees] the joint registration must not take a pose."""
+BRIDGE = 5
+"""Frames without a pose over which constant speed is still believed."""
 MAX_GAP = 10
 """Frames after which a camera that was lost may be anywhere."""
 MAX_MOTION = 0.3, 30.0
@@ -181,6 +183,8 @@ class DirectState:
     """A place that is not confirmed yet: its pose and the motion there, float64 (2, 4, 4)."""
     confirmed: int
     """Frames that agree with it; 0 = there is no such place."""
+    motion: np.ndarray
+    """How the camera moved while it took the last frame, as `FrameMotion.to_array` has it, float64 (8,)."""
     depth_sigma: float
     """What the second witness has learnt of depth [1/m]."""
     typical: tuple[float, float]
@@ -229,6 +233,8 @@ class DirectTracker:
         self._typical_cost = np.inf
         self._before: _Before | None = None
         self._found: _Found | None = None
+        self._is_foretold = False
+        self._rivals: list[Attempt] = []
         self._rotations = rotation_grid(config.search_span)
         self._second = SecondWitness(camera, device, max_depth, keyframes, images)
         self.counts = {"sure": 0, "searched": 0}
@@ -256,7 +262,8 @@ class DirectTracker:
         elif history.last_known is None and not self._has_kept_before:
             self._before = None  # the pose was forgotten: nothing tells where that frame is from here
         found = self._found
-        starts = history.starts(constant_speed=True) if found is None else found.starts
+        starts = history.starts(constant_speed=True, bridge=BRIDGE) if found is None else found.starts
+        self._is_foretold, self._rivals = len(starts) > 1, []
         best: Attempt | None = None
         done: Followed | None = None
         if history.was_known or found is not None:
@@ -337,6 +344,10 @@ class DirectTracker:
         """
         last = history.last_known
         gap = MAX_GAP + 1 if last is None else len(history) - last
+        is_near = self._is_foretold and attempt.moved < NEAR_SHIFT
+        if not is_near and self._has_rival(pose, attempt):
+            self._found = None
+            return "two places look alike from here"
         if gap <= MAX_GAP and not history.is_jump(pose, *MAX_MOTION):
             return ""
         m, back = attempt.measures, attempt.back
@@ -353,6 +364,16 @@ class DirectTracker:
         motion = np.eye(4) if before is None else inverse(before) @ pose
         self._found = _Found(pose, motion, count)
         return f"found again, to be confirmed by the frames that follow ({count} of {CONFIRMATIONS})"
+
+    def _has_rival(self, pose: np.ndarray, attempt: Attempt) -> bool:
+        """Whether another place fits the frame nearly as well."""
+        for other in self._rivals:
+            step, turn = motion_between(pose, self._pose_of(other))
+            is_elsewhere = step > MAX_JOINT_STEP or turn > MAX_JOINT_TURN
+            fits = other.measures.agreement > FOUND_AGREEMENT and other.cost < UNIQUE * attempt.cost
+            if is_elsewhere and fits:
+                return True
+        return False
 
     # -- registration --------------------------------------------------------------------------------------------
 
@@ -485,7 +506,7 @@ class DirectTracker:
     def _is_good(self, attempt: Attempt) -> bool:
         """Whether the pose can be believed."""
         m, config = attempt.measures, self.config
-        is_near = attempt.moved < NEAR_SHIFT and m.agreement > config.sure_agreement
+        is_near = self._is_foretold and attempt.moved < NEAR_SHIFT and m.agreement > config.sure_agreement
         return (
             attempt.ok
             and m.agreement > config.lost_agreement
@@ -508,8 +529,10 @@ class DirectTracker:
         picture = self._picture(frame)
         if history.last_known is not None or self._found is not None:
             poses = [*starts, *self._turned(row, starts)]
-            found = self._search(row, self._reference, poses, starts[0], None)
-            if best is None or not self._is_good(best) or best.moved > NEAR_SHIFT:
+            foretold = starts[0] if self._is_foretold else None
+            found = self._search(row, self._reference, poses, foretold, None)
+            is_near = self._is_foretold and best is not None and best.moved < NEAR_SHIFT
+            if best is None or not self._is_good(best) or not is_near:
                 best = _better(best, found, by_cost=True)
             elif found is not None and self._is_good(found) and found.cost < DECISIVE * best.cost:
                 best = found
@@ -522,7 +545,7 @@ class DirectTracker:
             before = self._before
             if history.was_known and before is not None and before.index != self._reference_frame:
                 self._keep_before(history)
-                best = _better(best, self._search(row, self._reference, poses, starts[0], None))
+                best = _better(best, self._search(row, self._reference, poses, foretold, None))
                 best = self._judge(row, best, witness)
                 if best is not None and self._is_good(best):
                     return best
@@ -635,6 +658,7 @@ class DirectTracker:
                 moved = self._shift(row, inverse(foretold) @ W, result["T"])
                 found = replace(found, moved=moved, cost=found.cost * (1.0 + SHIFT_PRICE * moved))
             if found.ok:
+                self._rivals.append(found)
                 best = _better(best, found, by_cost=True)
         return best
 
@@ -891,15 +915,13 @@ class DirectTracker:
             before=-1 if self._before is None else self._before.index,
             found=np.tile(np.eye(4), (2, 1, 1)) if found is None else np.stack([found.pose, found.motion]),
             confirmed=0 if found is None else found.count,
+            motion=self.motion.to_array(),
             depth_sigma=self._second.depth_sigma,
             typical=(self._typical_scale, self._typical_cost),
         )
 
-    def restore(self, state: DirectState, current: int | None, motion: FrameMotion) -> None:
-        """Go on from what `state` returned; keyframes and images are restored already.
-
-        current: The frame in slot 0. motion: How the camera moved meanwhile.
-        """
+    def restore(self, state: DirectState, current: int | None) -> None:
+        """Go on from what `state` returned; keyframes and images are restored already, ``current`` is in slot 0."""
         pairs = zip(state.anchors.tolist(), state.relative, strict=True)
         self._anchors = [None if k < 0 else _Anchor(k, T.copy()) for k, T in pairs]
         self._overlap = {k: share for k, share in enumerate(state.overlap.tolist()) if share >= 0}
@@ -915,7 +937,7 @@ class DirectTracker:
         if state.before == current:
             rgb, units, scale = self.images.current()
             self._upload(state.before, rgb, units, scale)
-            self._set_motion(state.before, motion)
+            self._set_motion(state.before, FrameMotion.from_array(state.motion))
         elif keyframe is not None:
             rgb, units, scale = self.images.kept(keyframe.image).unpack(self.camera)
         else:
