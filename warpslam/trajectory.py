@@ -136,7 +136,8 @@ class FrameHistory:
         if located.status is not FrameStatus.OK:
             self._append(timestamp, self.last_pose, FrameStatus.LOST)
             return
-        if self._poses:
+        # Over a gap that was bridged the speed before it is believed.
+        if self._poses and (self._status[-1] is FrameStatus.OK or located.after_loss):
             self._motion = np.linalg.inv(self.last_pose) @ located.T_world_camera
         self._append(timestamp, located.T_world_camera, FrameStatus.OK, located.depth_error)
 
@@ -207,7 +208,8 @@ class FrameHistory:
         if last is None:
             return []
         T, gap = self._poses[last], len(self) - 1 - last
-        if constant_speed and gap <= bridge and self.follows(last):
+        is_moving = last > self._first if bridge else self.follows(last)
+        if constant_speed and gap <= bridge and is_moving:
             return [T @ np.linalg.matrix_power(self._motion, 1 + gap) if gap else T @ self._motion, T]
         return [T]
 

@@ -326,9 +326,10 @@ class DirectTracker:
 
     def _located(self, pose: np.ndarray, done: Followed, history: FrameHistory) -> Located:
         measures = done.attempt.measures
+        is_bridged = self._is_foretold and self._found is None and done.attempt.moved < NEAR_SHIFT
         return Located(
             pose,
-            after_loss=not history.was_known,
+            after_loss=not history.was_known and not is_bridged,
             inliers=measures.agreement,
             depth_error=done.depth_error,
             loss=done.attempt.cost,
