@@ -340,7 +340,9 @@ def test_bad_frames_are_skipped_and_nothing_is_lost(frames, optimizer):
     if optimizer == "direct":
         for n in range(2, 5):
             result = slam.step(frames[n].rgb, frames[n].depth, frames[n].timestamp)
-            assert result.status == "LOST" and f"to be confirmed by the frames that follow ({n - 1} of" in result.message
+            assert (
+                result.status == "LOST" and f"to be confirmed by the frames that follow ({n - 1} of" in result.message
+            )
     last = frames[5 if optimizer == "direct" else 2]
     result = slam.step(last.rgb, last.depth, last.timestamp)
     assert result.status == "OK"

@@ -71,7 +71,10 @@ def test_minimum_out_of_reach_is_not_determined():
 
 
 class SweptSequence(RgbdSequence):
-    """A camera that swings through a room, with a delay and a rolling shutter; ``speed`` scales its motion."""
+    """A camera that swings through a room, with a delay and a rolling shutter; ``speed`` scales its motion.
+
+    Its noise is a Kinect's after images of 640 x 480 were halved twice.
+    """
 
     name = "swept"
     intrinsics = CAMERA
@@ -100,25 +103,28 @@ class SweptSequence(RgbdSequence):
         twist = np.r_[step[:3, 3], step[2, 1], step[0, 2], step[1, 0]] / (2 * dt)
         offset = self.true.depth_delay + self.stamped
         rgb, depth = self.room.take(CAMERA, pose, FrameMotion(tuple(twist), offset, self.true.readout))
+        noise = np.random.default_rng(index)
+        rgb = np.clip(rgb + noise.normal(0.0, 2.0, rgb.shape), 0, 255).astype(np.uint8)
+        depth += 0.25 * (0.0012 + 0.0019 * (depth - 0.4) ** 2) * noise.normal(size=depth.shape).astype(np.float32)
         return Frame(index, time, rgb, depth, pose, time + self.stamped if self.stamped else None)
 
 
 @pytest.mark.parametrize("stamped", [0.0, 0.009])
 def test_timing_of_a_camera_in_a_room(stamped):
-    """Found to 2 ms, beyond what the stamps say; at the truth the cost is far below that without correction."""
+    """Found to 3 ms, beyond what the stamps say; at the truth the cost is well below that without correction."""
     cost = AlignmentCost(SweptSequence(stamped=stamped), range(FRAMES), wp.get_device("cpu"))
     assert len(cost.pairs) >= 25
-    assert cost(TRUE) < 0.3 * cost(SensorTiming())
+    assert cost(TRUE) < 0.9 * cost(SensorTiming())
     estimate = find_timing(cost)
     assert estimate.depth_delay.is_determined and estimate.readout.is_determined
-    assert estimate.depth_delay.seconds == pytest.approx(TRUE.depth_delay, abs=0.002)
-    assert estimate.readout.seconds == pytest.approx(TRUE.readout, abs=0.002)
+    assert estimate.depth_delay.seconds == pytest.approx(TRUE.depth_delay, abs=0.003)
+    assert estimate.readout.seconds == pytest.approx(TRUE.readout, abs=0.003)
 
 
 def test_global_shutter_without_delay_is_found_to_be_one():
-    """Nothing to correct: 0 and 0, to 2 ms."""
+    """Nothing to correct: 0 and 0, to 3 ms."""
     estimate = find_timing(AlignmentCost(SweptSequence(SensorTiming()), range(FRAMES), wp.get_device("cpu")))
-    assert abs(estimate.depth_delay.seconds) < 0.002 and estimate.readout.seconds < 0.002
+    assert abs(estimate.depth_delay.seconds) < 0.003 and estimate.readout.seconds < 0.003
 
 
 def test_sharp_texture_does_not_draw_away_from_nothing():
@@ -171,8 +177,8 @@ def test_command_prints_and_writes_the_camera(recording, capsys):
     assert "with stamps of depth" in out and "raise the cost by 1 %" in out and "written to" in out
     sequence = open_sequence(recording)
     assert sequence.intrinsics == CAMERA
-    assert sequence.timing.depth_delay == pytest.approx(TRUE.depth_delay, abs=0.0025)
-    assert sequence.timing.readout == pytest.approx(TRUE.readout, abs=0.0025)
+    assert sequence.timing.depth_delay == pytest.approx(TRUE.depth_delay, abs=0.004)
+    assert sequence.timing.readout == pytest.approx(TRUE.readout, abs=0.004)
     assert f"depth_delay: {sequence.timing.depth_delay:g}\nreadout: {sequence.timing.readout:g}" in out
     assert cli.main(["calibrate-time", str(recording), "--device", "cpu", "--frames", "0:8"]) == 2
     assert "pairs of frames" in capsys.readouterr().err

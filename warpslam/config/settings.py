@@ -189,7 +189,7 @@ class DirectConfig(_Group):
     grey_weight: float = Field(2.0, ge=0, description="weight of the photometric residual")
     depth_weight: float = Field(1.0, ge=0, description="weight of the geometric residual")
     grey_floor: float = Field(2.0, gt=0, description="photometric residuals spread by no less [grey values of 255]")
-    depth_floor: float = Field(0.3, gt=0, description="geometric residuals spread by no less [sigma of depth]")
+    depth_floor: float = Field(0.02, gt=0, description="geometric residuals spread by no less [sigma of depth]")
     joint: int = Field(3, ge=0, le=4, description="keyframes that a pose is registered to at once; 0 = the nearest")
     joint_iterations: int = Field(3, ge=1, le=20, description="iterations of that")
     window: int = Field(7, ge=0, le=20, description="keyframes refined when one is added; 0 = none")

@@ -288,12 +288,23 @@ class Run:
         write_trajectory(folder, trajectory, record)
         self.ate = evaluate_trajectory(trajectory, record, metrics)
         write_map(folder, slam, record, metrics)
+        if not self._makes_map:
+            log.info("mapping.enabled is off: there is a trajectory, and no map to make a mesh of")
+            metrics.fill({"mesh": {"error": "mapping.enabled is off"}})
+            draw_plots(folder, trajectory, self.ate, record)
+            return
         extract_and_write_mesh(folder, slam, record, metrics)
         self.reconstruction = evaluate_reconstruction(
             folder, self.truth_mesh, self.sequence, trajectory, record, metrics, self.request.device
         )
         draw_plots(folder, trajectory, self.ate, record)
         draw_panels(folder, slam, self.sequence, trajectory, record, metrics)
+
+    @property
+    def _makes_map(self) -> bool:
+        """Whether there is a map in the end."""
+        config = self.request.config
+        return self.request.map is not None or config is None or config.mapping.enabled
 
     def _write_account(self) -> None:
         """All that is written however the run ended: figures, what became of each frame, and the report."""

@@ -41,6 +41,8 @@ TOLERANCE = 0.01
 MAX_SPREAD = 0.015
 """A value that may be further off than this [s] is not determined."""
 
+MIN_WIDTH = 120
+"""The second largest images of the pyramid are compared if they are as wide [px], else the largest."""
 PAIRS = 40
 """Pairs of frames that are aligned."""
 GAPS = (3, 4)
@@ -217,7 +219,8 @@ class AlignmentCost:
     def __post_init__(self) -> None:
         camera: Intrinsics = self.sequence.intrinsics
         self._plan = PyramidPlan.of(camera)
-        self._level = min(1, self._plan.top)
+        is_fine = self._plan.top >= 1 and int(self._plan.levels[1]["width"]) >= MIN_WIDTH
+        self._level = 1 if is_fine else 0
         starts = _spread(len(self.selected), PAIRS)
         # Three rows more for the frames around one.
         self._registrar = Registrar(self._plan, 2 * len(starts) + 3, self.max_depth, FLOORS, self.device)

@@ -26,6 +26,8 @@ Mat88 = wp.types.matrix(shape=(8, 8), dtype=wp.float32)
 Vec6 = wp.types.vector(length=6, dtype=wp.float32)
 Vec8 = wp.types.vector(length=8, dtype=wp.float32)
 Vec16 = wp.types.vector(length=16, dtype=wp.float32)
+Triangle = wp.types.vector(length=36, dtype=wp.float32)
+"""Lower triangle of a symmetric matrix (8, 8), row by row."""
 Mat88d = wp.types.matrix(shape=(8, 8), dtype=wp.float64)
 Vec8d = wp.types.vector(length=8, dtype=wp.float64)
 
@@ -91,8 +93,31 @@ _GROUP_SUM = """
 """
 
 
-@wp.func_native(_GROUP_SUM.replace("COUNT", "64").replace("ENTRY", "x.data[i / 8][i % 8]"))
-def group_sum_matrix(x: Mat88) -> Mat88: ...
+@wp.func_native(_GROUP_SUM.replace("COUNT", "36").replace("ENTRY", "x.c[i]"))
+def group_sum_triangle(x: Triangle) -> Triangle: ...
+
+
+@wp.func_native("""
+    #pragma unroll
+    for (int i = 0; i < 8; ++i) {
+        const wp::float32 w_i = w * J.c[i];
+        #pragma unroll
+        for (int j = 0; j <= i; ++j) H.c[i * (i + 1) / 2 + j] += w_i * J.c[j];
+    }
+    return H;
+""")
+def add_outer(H: Triangle, J: Vec8, w: wp.float32) -> Triangle: ...
+
+
+@wp.func_native("""
+    wp::mat_t<8, 8, wp::float32> A;
+    #pragma unroll
+    for (int i = 0; i < 8; ++i)
+        #pragma unroll
+        for (int j = 0; j < 8; ++j) A.data[i][j] = i < j ? H.c[j * (j + 1) / 2 + i] : H.c[i * (i + 1) / 2 + j];
+    return A;
+""")
+def whole(H: Triangle) -> Mat88: ...
 
 
 @wp.func_native(_GROUP_SUM.replace("COUNT", "8").replace("ENTRY", "x.c[i]"))
@@ -158,19 +183,22 @@ def evaluate(
     exposure: wp.vec2,
     weights: Weights,
     gate: float,
+    stride: int,
     lane: int,
     lanes: int,
     bins: wp.array[int],
 ) -> Sums:
-    """Normal equations of a pair at one level; ``bins`` gets the histograms of the residuals."""
-    H = Mat88()
+    """Normal equations of a pair at one level, over every ``stride``-th point; ``bins`` gets the histograms of the
+    residuals.
+    """
+    H = Triangle()
     g = Vec8()
     counts = Vec16()
     G = motion.to_depth * T
     for k in range(lane, 2 * _BINS, lanes):
         bins[k] = 0
     group_wait()
-    for k in range(level.first_point + lane, level.first_point + level.points, lanes):
+    for k in range(level.first_point + stride * lane, level.first_point + level.points, stride * lanes):
         X = points.position[keyframe, k]
         if X[2] <= 0.0:
             continue
@@ -213,7 +241,7 @@ def evaluate(
                     turn = wp.cross(P, n)
                     J = Vec8(-n[0], -n[1], -n[2], -turn[0], -turn[1], -turn[2], 0.0, 0.0) / s
                     w = weights.depth * student(ratio) / (weights.depth_scale * weights.depth_scale)
-                    H += wp.outer(w * J, J)
+                    H = add_outer(H, J, w)
                     g += (w * r) * J
                     counts[_DEPTH_COUNT] += 1.0
                     counts[_COST] += weights.depth * student_cost(ratio)
@@ -229,7 +257,7 @@ def evaluate(
             turn = wp.cross(p, j)
             J = Vec8(j[0], j[1], j[2], turn[0], turn[1], turn[2], -key, -1.0)
             w = weights.grey * student(ratio) / (weights.grey_scale * weights.grey_scale)
-            H += wp.outer(w * J, J)
+            H = add_outer(H, J, w)
             g += (w * r) * J
             counts[_GREY_COUNT] += 1.0
             counts[_COST] += weights.grey * student_cost(ratio)
@@ -241,7 +269,7 @@ def evaluate(
             wp.atomic_add(bins, wp.min(int(wp.abs(r) / _GREY_BIN), _BINS - 1), 1)
     group_wait()
     sums = Sums()
-    sums.H = group_sum_matrix(H)
+    sums.H = whole(group_sum_triangle(H))
     sums.g = group_sum_vector(g)
     sums.counts = group_sum_counts(counts)
     return sums

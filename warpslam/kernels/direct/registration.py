@@ -58,6 +58,7 @@ COST_DEPTH_SCALE = wp.constant(8.0)
 OUT_OF_VIEW = wp.constant(0.3)
 """Cost of a point that is not in view: a higher one draws to poses that see all."""
 
+GLANCE = wp.constant(3)
 FIRST_WIDTH = wp.constant(20.0)
 ANNEALING = wp.constant(0.6)
 START_COST = wp.constant(0)
@@ -223,6 +224,10 @@ def register(
     costs = with_scales(1.0, 1.0, COST_GREY_SCALE, COST_DEPTH_SCALE)
     weights = with_scales(task.grey, task.depth, 20.0, 5.0)
     result.ok = 1
+    # A first look at many starts need not be at every point.
+    stride = int(1)
+    if task.iterations == -2:
+        stride = GLANCE
     while phase != DONE:
         at = n
         gate = float(1.0e9)
@@ -233,7 +238,20 @@ def register(
             gate = levels[n].gate
             current = weights
         sums = evaluate(
-            levels[at], points, task.keyframe, images, task.row, motion, T, exposure, current, gate, lane, lanes, bins
+            levels[at],
+            points,
+            task.keyframe,
+            images,
+            task.row,
+            motion,
+            T,
+            exposure,
+            current,
+            gate,
+            stride,
+            lane,
+            lanes,
+            bins,
         )
         if phase == START_COST:
             result.start_cost = cost_of(sums.counts)
@@ -377,6 +395,7 @@ def register_jointly(
             exposure,
             weights,
             level.gate,
+            1,
             lane,
             lanes,
             bins,
@@ -502,6 +521,7 @@ def sum_pairs(
             pair.exposure,
             weights,
             level.gate,
+            1,
             lane,
             lanes,
             bins,

@@ -55,7 +55,7 @@ CONFIRMATIONS = 3
 """Frames that must follow before a place found again is believed."""
 UNIQUE = 1.5
 """Another place that costs less than this multiple of the best is as likely."""
-WITNESS_KEYFRAMES = 5
+WITNESS_KEYFRAMES = 3
 """Keyframes whose features a frame is matched with."""
 DIFFERENT_STEP, DIFFERENT_TURN = 0.03, 1.5
 """Two answers that are further apart [m], [degrees] contradict each other."""
@@ -67,6 +67,10 @@ SHIFT_PRICE = 0.02
 """Growth of the cost of a pose by each pixel that it is away from what was foretold."""
 VARIANCE_FACTOR = 50.0
 """Of the covariance: on rendered scenes, with noise and without, 90 to 99 % of true errors lie within two sigma."""
+LEAST_COST = 0.5
+"""A registration that costs less needs no comparison with others."""
+SEARCH_WIDE, SEARCH_DEEP = 6, 3
+"""Starts refined at the middle level, and of these at the largest."""
 SCRATCH = 0
 """Row of points that hold no keyframe's."""
 
@@ -94,6 +98,10 @@ class Attempt:
     """The keyframe in the frame's points, the other way round."""
     moved: float = 0.0
     """How far the image moved from the start [px of the middle level]."""
+
+
+_Start = tuple[float, np.ndarray, np.ndarray]
+"""Cost, T_frame_keyframe (4, 4), and exposure (2,) of a start."""
 
 
 @dataclass(frozen=True)
@@ -465,9 +473,14 @@ class DirectTracker:
             and m.view > 0.4
             and m.known > 0.2
             and attempt.grey_scale < limit
-            and attempt.cost < max(config.sure_cost * self._typical_cost, 0.5)
+            and attempt.cost < self._usual_cost
             and attempt.moved < config.sure_shift
         )
+
+    @property
+    def _usual_cost(self) -> float:
+        """What a right pose costs at most, as a rule."""
+        return max(self.config.sure_cost * self._typical_cost, LEAST_COST)
 
     def _is_good(self, attempt: Attempt) -> bool:
         """Whether the pose can be believed."""
@@ -494,13 +507,15 @@ class DirectTracker:
         """At the reference, at the frame before, at older keyframes, until a pose is believed."""
         picture = self._picture(frame)
         if history.last_known is not None or self._found is not None:
-            witness = self._ask(picture, history, starts[0])
             poses = [*starts, *self._turned(row, starts)]
             found = self._search(row, self._reference, poses, starts[0], None)
             if best is None or not self._is_good(best) or best.moved > NEAR_SHIFT:
                 best = _better(best, found, by_cost=True)
             elif found is not None and self._is_good(found) and found.cost < DECISIVE * best.cost:
                 best = found
+            if best is not None and self._is_good(best) and best.cost < self._usual_cost:
+                return best
+            witness = self._ask(picture, history, starts[0])
             best = self._judge(row, best, witness)
             if best is not None and self._is_good(best):
                 return best
@@ -607,21 +622,14 @@ class DirectTracker:
         if self.config.search_weak:
             tried += self._weak_starts(row, points_row, [tasks[0]["T"], tried[0][1]])
             tried.sort(key=lambda one: one[0])
-        chosen: list[tuple[float, np.ndarray, np.ndarray]] = []
-        for one in tried:
-            if not np.isfinite(one[1]).all():
-                continue
-            motions = [motion_between(other[1].astype(np.float64), one[1].astype(np.float64)) for other in chosen]
-            if all(step >= 0.015 or turn >= 0.7 for step, turn in motions):
-                chosen.append(one)
-            if len(chosen) == 6:
-                break
-        tasks = self._task(len(chosen))
-        tasks["keyframe"], tasks["row"], tasks["cost_level"] = points_row, row, 0
-        tasks["top"], tasks["low"] = middle, 0
-        for task, (_, T, exposure) in zip(tasks, chosen, strict=True):
-            task["T"], task["exposure"] = T, exposure
-        for result in self.registrar.register(tasks):
+        chosen = _apart([one for one in tried if np.isfinite(one[1]).all()], SEARCH_WIDE)
+        tasks = self._refinements(row, points_row, chosen)
+        tasks["top"], tasks["low"], tasks["cost_level"] = middle, middle, middle
+        refined = [(float(r["end_cost"]), r["T"], r["exposure"]) for r in self.registrar.register(tasks) if r["ok"]]
+        chosen = _apart(sorted(refined, key=lambda one: one[0]), SEARCH_DEEP)
+        tasks = self._refinements(row, points_row, chosen)
+        tasks["top"], tasks["low"], tasks["cost_level"] = min(self.judged, middle), 0, 0
+        for result in self.registrar.register(tasks) if len(tasks) else ():
             found = self._attempt(keyframe, result)
             if foretold is not None:
                 moved = self._shift(row, inverse(foretold) @ W, result["T"])
@@ -630,9 +638,14 @@ class DirectTracker:
                 best = _better(best, found, by_cost=True)
         return best
 
-    def _weak_starts(
-        self, row: int, points_row: int, transforms: Sequence[np.ndarray]
-    ) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    def _refinements(self, row: int, points_row: int, chosen: Sequence[_Start]) -> Any:
+        tasks = self._task(len(chosen))
+        tasks["keyframe"], tasks["row"] = points_row, row
+        for task, (_, T, exposure) in zip(tasks, chosen, strict=True):
+            task["T"], task["exposure"] = T, exposure
+        return tasks
+
+    def _weak_starts(self, row: int, points_row: int, transforms: Sequence[np.ndarray]) -> list[_Start]:
         """Poses along the two motions that depth determines least: a corridor's length, a wall's plane."""
         middle = self.plan.middle
         tasks = self._task(len(transforms))
@@ -653,7 +666,7 @@ class DirectTracker:
         tasks["top"], tasks["low"], tasks["iterations"] = middle, middle, -2
         tasks["T"] = np.asarray(moves)
         costs = self.registrar.register(tasks)["start_cost"]
-        found: list[tuple[float, np.ndarray, np.ndarray]] = []
+        found: list[_Start] = []
         for n in np.argsort(costs, kind="stable"):
             T = moves[n]
             motions = [motion_between(other[1], T) for other in found]
@@ -988,6 +1001,18 @@ class DirectTracker:
                 self._anchors[index] = _Anchor(0, T)
                 if index < len(history):
                     history.correct(index, W @ T)
+
+
+def _apart(starts: Sequence[_Start], count: int) -> list[_Start]:
+    """The first of some starts, without those that another one is next to."""
+    chosen: list[_Start] = []
+    for one in starts:
+        motions = [motion_between(other[1].astype(np.float64), one[1].astype(np.float64)) for other in chosen]
+        if all(step >= 0.015 or turn >= 0.7 for step, turn in motions):
+            chosen.append(one)
+        if len(chosen) == count:
+            break
+    return chosen
 
 
 def _better(a: Attempt | None, b: Attempt | None, *, by_cost: bool = False) -> Attempt | None:
