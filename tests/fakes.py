@@ -66,6 +66,8 @@ class FakeResult:
     losses: dict[str, float] = field(default_factory=lambda: {"loss": 1.5})
     inliers: float = 0.9
     depth_error: float = 0.02
+    correlation: float | None = None
+    covariance: np.ndarray | None = None
     timings: dict[str, float] = field(default_factory=lambda: {"tracking": 0.25, "mapping": 0.5})
     message: str = ""
 

@@ -260,13 +260,16 @@ class Slam:
                     self.direct.place(frame, pose)
             return Located(pose)
         with account.timed("tracking"):
-            if self.direct is not None:
-                return self.direct.locate(frame, self.history)
-            self.images.rectify_current(self._motion(frame))
-            located = self.localizer.locate(self.scene.arrays(), self.images, frame.index, self.history, self.keyframes)
+            located = self._track(frame)
         if located.loss is not None:
             account.losses["tracking"] = located.loss
         return located
+
+    def _track(self, frame: AdmittedFrame) -> Located:
+        if self.direct is not None:
+            return self.direct.locate(frame, self.history)
+        self.images.rectify_current(self._motion(frame))
+        return self.localizer.locate(self.scene.arrays(), self.images, frame.index, self.history, self.keyframes)
 
     @property
     def _has_begun(self) -> bool:
