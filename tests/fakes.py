@@ -13,6 +13,7 @@ import trimesh
 from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.errors import DatasetError, MeshError
+from warpslam.frames import FrameResult
 from warpslam.pipeline import run as pipeline
 from warpslam.poses import pose_from_vector
 from warpslam.runs.record import RunResult
@@ -68,6 +69,7 @@ class FakeResult:
     depth_error: float = 0.02
     correlation: float | None = None
     covariance: np.ndarray | None = None
+    sigma = FrameResult.sigma
     timings: dict[str, float] = field(default_factory=lambda: {"tracking": 0.25, "mapping": 0.5})
     message: str = ""
 

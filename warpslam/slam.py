@@ -314,7 +314,10 @@ class Slam:
             depth = frame.depth if self.images.motion.is_none else self.images.current_depth()
             extent = measured_extent(depth, pose, self.intrinsics)
             task = MappingTask("first" if is_first else "frame", frame.index, pose, extent)
-            self.scheduler.start(task, [keyframe for keyframe in self.keyframes if keyframe.index != frame.index])
+            keyframes = self.keyframes  # the list itself: the frame may become one while it is mapped
+            if self.direct is not None:  # it may be one already
+                keyframes = [keyframe for keyframe in keyframes if keyframe.index != frame.index]
+            self.scheduler.start(task, keyframes)
             self._seen.append(SeenDepth.of(frame.index, depth))
             account.losses.update(self._take_over(wait=is_first))
 
