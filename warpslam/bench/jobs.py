@@ -86,7 +86,7 @@ def _job(
     if study.given_poses and poses is None:
         overrides.append("tracking.use_given_poses=true")
     if study.by_rendering and variant.method == "nice-slam":
-        overrides += _by_rendering(sequence.preset, overrides)
+        overrides += _by_rendering(sequence.preset or "default", overrides)
     frames = spec.frames or sequence.frames
     request = RunRequest(
         source=Source(path, sequence.dataset, sequence.camera),
