@@ -21,6 +21,8 @@ from warpslam.runs.request import RunRequest
 from warpslam.sequences.base import Frame, RgbdSequence
 
 CAMERA = Intrinsics(20, 20, 15.5, 11.5, 32, 24)
+COVARIANCE = (4e-6, 9e-6, 1e-6, 1e-4, 1e-5, 1e-6)
+"""Variances of a pose, [m^2] and [rad^2]."""
 
 
 class Terminal(io.StringIO):
@@ -67,8 +69,8 @@ class FakeResult:
     losses: dict[str, float] = field(default_factory=lambda: {"loss": 1.5})
     inliers: float = 0.9
     depth_error: float = 0.02
-    correlation: float | None = None
-    covariance: np.ndarray | None = None
+    correlation: float | None = 0.95
+    covariance: np.ndarray | None = field(default_factory=lambda: np.diag(COVARIANCE))
     sigma = FrameResult.sigma
     timings: dict[str, float] = field(default_factory=lambda: {"tracking": 0.25, "mapping": 0.5})
     message: str = ""
