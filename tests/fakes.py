@@ -21,6 +21,8 @@ from warpslam.runs.request import RunRequest
 from warpslam.sequences.base import Frame, RgbdSequence
 
 CAMERA = Intrinsics(20, 20, 15.5, 11.5, 32, 24)
+COVARIANCE = (4e-6, 9e-6, 1e-6, 1e-4, 1e-5, 1e-6)
+"""Variances of a pose, [m^2] and [rad^2]."""
 
 
 class Terminal(io.StringIO):
@@ -102,7 +104,7 @@ class FakeSlam:
         T[0, 3] += 0.01 * (index % 2)
         status = FrameStatus.LOST if index == self.lost_at else FrameStatus.OK
         timings = {"tracking": 0.25, "mapping": 0.5}
-        result = FrameResult(index, timestamp, T, status, {"loss": 1.5}, 0.9, 0.02, correlation=0.95, timings=timings)
+        result = FrameResult(index, timestamp, T, status, {"loss": 1.5}, 0.9, 0.02, 0.95, np.diag(COVARIANCE), timings)
         self.results.append(result)
         return self.results[-1]
 

@@ -16,6 +16,7 @@ from warpslam.field.decoder_files import load_decoders
 from warpslam.slam import Slam
 from warpslam.slam_state import state_arrays, state_from_arrays
 from warpslam.synthetic import SyntheticSequence
+from warpslam.tracking.direct import tracker
 
 CAMERA = Intrinsics(40.0, 40.0, 23.5, 17.5, 48, 36)
 IMAGE_GIGABYTES = 5 * 48 * 36 / 1e9
@@ -63,6 +64,41 @@ def test_everything_comes_back(state):
     for name, array in arrays.items():
         assert again[name].dtype == array.dtype, name
         np.testing.assert_array_equal(again[name], array, err_msg=name)
+
+
+@pytest.mark.parametrize("forgotten", [False, True])
+def test_saved_at_bad_moments_it_goes_on_exactly(frames, monkeypatch, forgotten):
+    """With more keyframes than are looked at or whose images are held, frames that are lost, one without depth, and a
+    pose that was forgotten: from a state before, amid and after them the others get the same poses, to the bit.
+    """
+    for name, value in (("RECENT", 2), ("CACHED", 3), ("NEAR_KEYFRAMES", 3)):
+        monkeypatch.setattr(tracker, name, value)
+    noise = np.random.default_rng(0).uniform(0.3, 9.0, frames[4].depth.shape).astype(np.float32)
+    depths = [frame.depth for frame in frames]
+    depths[5], depths[6], depths[7] = noise, np.zeros_like(noise), noise
+
+    def step(slam: Slam, n: int) -> None:
+        if n == 6 and forgotten:
+            slam.forget_pose()
+        slam.step(frames[n % 10].rgb, depths[n] if n < 10 else frames[n - 10].depth, n / 30)
+
+    def start(state=None) -> Slam:
+        return run([], "mapping.enabled=false") if state is None else Slam.from_state(state, "cpu")
+
+    whole, states = start(), []
+    for n in range(14):
+        step(whole, n)
+        states.append(state_arrays(whole.state()))
+    assert len(whole.keyframes) > 5 and {"LOST", "SKIPPED"} < set(whole.trajectory.status)
+    assert (states[4][1]["direct_overlap"] == -1).any()
+    for first in (5, 6, 8, 11):
+        again = start(state_from_arrays("map", *states[first - 1]))
+        for n in range(first, 14):
+            step(again, n)
+        header, arrays = state_arrays(again.state())
+        assert header == states[-1][0], first
+        for name, array in states[-1][1].items():
+            np.testing.assert_array_equal(arrays[name], array, err_msg=f"{name}, from frame {first} on")
 
 
 def test_frame_that_was_nowhere_can_be_saved(frames, tmp_path):

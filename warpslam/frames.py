@@ -53,7 +53,9 @@ class FrameResult:
     status: FrameStatus = FrameStatus.OK
     """OK, LOST or SKIPPED."""
     losses: dict[str, float] = field(default_factory=dict)
-    """Mean loss per ray: "tracking", and of the stages of mapping that was done by then."""
+    """Mean loss per ray: "tracking" (with direct tracking the robust cost per point), and of the stages of mapping that
+    was done by then.
+    """
     inliers: float = 1.0
     """Share of the depth rays into what the map has seen that agree with it, in [0, 1]."""
     depth_error: float = 0.0

@@ -274,13 +274,16 @@ class Slam:
                     self.direct.place(frame, pose)
             return Located(pose)
         with account.timed("tracking"):
-            if self.direct is not None:
-                return self.direct.locate(frame, self.history)
-            self.images.rectify_current(self._motion(frame))
-            located = self.localizer.locate(self.scene.arrays(), self.images, frame.index, self.history, self.keyframes)
+            located = self._track(frame)
         if located.loss is not None:
             account.losses["tracking"] = located.loss
         return located
+
+    def _track(self, frame: AdmittedFrame) -> Located:
+        if self.direct is not None:
+            return self.direct.locate(frame, self.history)
+        self.images.rectify_current(self._motion(frame))
+        return self.localizer.locate(self.scene.arrays(), self.images, frame.index, self.history, self.keyframes)
 
     @property
     def _has_begun(self) -> bool:
@@ -326,7 +329,10 @@ class Slam:
             depth = frame.depth if self.images.motion.is_none else self.images.current_depth()
             extent = measured_extent(depth, pose, self.intrinsics)
             task = MappingTask("first" if is_first else "frame", frame.index, pose, extent)
-            self.scheduler.start(task, [keyframe for keyframe in self.keyframes if keyframe.index != frame.index])
+            keyframes = self.keyframes  # the list itself: the frame may become one while it is mapped
+            if self.direct is not None:  # it may be one already
+                keyframes = [keyframe for keyframe in keyframes if keyframe.index != frame.index]
+            self.scheduler.start(task, keyframes)
             self._seen.append(SeenDepth.of(frame.index, depth))
             account.losses.update(self._take_over(wait=is_first))
 

@@ -65,11 +65,14 @@ def test_yaml_round_trip(tmp_path):
 
 
 def test_given_poses_decide_what_was_left_open():
-    """No bundle adjustment, and a start from depth unless it is off; without them all is as it was asked for."""
+    """No bundle adjustment, and a start from depth unless it is off; without them all is as it was asked for, but that
+    with direct tracking mapping adjusts no poses.
+    """
     given = Config.from_preset("default", ["tracking.use_given_poses=true"]).resolved().mapping
     assert (given.bundle_adjustment, given.depth_start) == (False, True)
-    tracked = Config().resolved().mapping
-    assert (tracked.bundle_adjustment, tracked.depth_start) == (True, False)
+    for optimizer in ("direct", "adam", "gauss_newton"):
+        tracked = Config.from_preset("default", [f"tracking.optimizer={optimizer}"]).resolved().mapping
+        assert (tracked.bundle_adjustment, tracked.depth_start) == (optimizer != "direct", False)
     for name in PRESETS:
         for overrides in ([], ["tracking.use_given_poses=true"], ["mapping.depth_start=true"]):
             config = Config.from_preset(name, overrides)
@@ -87,7 +90,8 @@ def test_given_poses_decide_what_was_left_open():
                 if bool(value) != bool(getattr(resolved.mapping, name))
             ]
             assert set(changed) <= {"bundle_adjustment", "depth_start"}
-            assert config.tracking.use_given_poses or not changed
+            followed = {"bundle_adjustment"} if config.tracking.optimizer == "direct" else set()
+            assert config.tracking.use_given_poses or set(changed) == followed
 
 
 def test_what_followed_from_given_poses_ends_with_them():

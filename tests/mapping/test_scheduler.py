@@ -171,7 +171,7 @@ def test_map_is_at_most_one_task_behind(frames, gated):
 
 def test_refined_poses_reach_keyframes_and_trajectory(frames, monkeypatch):
     """Bundle adjustment beside tracking refines keyframes, also the one that was made from the frame being mapped."""
-    slam = new_slam("mapping.bundle_adjustment_keyframes=2", "keyframes.every=2")
+    slam = new_slam("tracking.optimizer=gauss_newton", "mapping.bundle_adjustment_keyframes=2", "keyframes.every=2")
     for frame in frames[:4]:
         step(slam, frame)
         slam.wait()

@@ -11,7 +11,7 @@ import trimesh
 import yaml
 from PIL import Image
 
-from tests.fakes import FakeSequence, FakeSlam, run_sequence, true_pose, wall
+from tests.fakes import COVARIANCE, FakeSequence, FakeSlam, run_sequence, true_pose, wall
 from warpslam.config import Config
 from warpslam.errors import ConfigError, DatasetError, InputError, MeshError
 from warpslam.evaluation import load_mesh, psnr, ssim
@@ -90,11 +90,11 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
     frames = read_json(folder.frame_records)
     assert frames["left_out"] == [] and frames["frames"][2] == {
         "index": 2, "timestamp": 2 / 30, "status": "OK", "message": "", "inliers": 0.9, "depth_error": 0.02,
-        "losses": {"loss": 1.5},
+        "losses": {"loss": 1.5}, "correlation": 0.95, "covariance": np.diag(COVARIANCE).tolist(),
     }  # fmt: skip
     table = folder.frames.read_text().splitlines()
-    assert table[0] == "frame,timestamp,status,inliers,depth_error_m,message" and len(table) == 9
-    assert table[3] == "2,0.066667,OK,0.9000,0.02000,"
+    assert table[0] == "frame,timestamp,status,inliers,depth_error_m,correlation,sigma_m,sigma_deg,message"
+    assert table[3] == "2,0.066667,OK,0.9000,0.02000,0.9500,0.003000,0.572958," and len(table) == 9
     panels = load_panels(folder.panel_images)
     assert [panel.index for panel in panels] == [0, 2, 5, 7] and panels[1].rgb[0, 0].tolist() == [42, 42, 42]
     assert panels[0].rendered_depth[0, 0] == pytest.approx(2.03, abs=1e-3)

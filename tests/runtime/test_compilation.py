@@ -40,7 +40,8 @@ def empty_cache(monkeypatch, tmp_path):
     find_module(SMALL[0]).unload()
 
 
-def test_nothing_is_loaded_after_the_start(monkeypatch):
+@pytest.mark.parametrize("optimizer", ["adam", "direct"])
+def test_nothing_is_loaded_after_the_start(monkeypatch, optimizer):
     """A run down to its mesh launches kernels only from modules, and block sizes, that were loaded beforehand."""
     monkeypatch.setattr(recorder, "matrix_peak_gflops", lambda: 1.0)
     room = SyntheticSequence(1, 8, intrinsics=new_slam().intrinsics)
@@ -48,11 +49,13 @@ def test_nothing_is_loaded_after_the_start(monkeypatch):
         find_module(name).unload()
     pipeline.load_kernels(room, "cpu")
     with warpslam.profile() as profile:
-        slam = new_slam("mapping.first_iterations=12", "tracking.optimizer=adam")
+        doubtful = "direct.sure_correlation=1"  # features are asked, too
+        slam = new_slam("mapping.first_iterations=12", f"tracking.optimizer={optimizer}", doubtful)
         for n in range(3):
             slam.step(room[n].rgb, room[n].depth, T_world_camera=room[n].T_world_camera)
         slam.mesh(voxel=0.2)
     assert slam.keyframes and profile.launches
+    assert optimizer != "direct" or slam.direct.counts["searched"] == 2
     assert [module.module for module in profile.report.modules] == []
 
 
