@@ -60,7 +60,7 @@ def test_report_in_a_browser(browser, make_run, tmp_path):
     document, console = open_page(browser, page, tmp_path / "profile")
     assert console == [] and document.external == []
     assert list(document.sections) == list(Page(folder.report.read_text(encoding="utf-8")).sections)
-    assert re.search(r"4 cursors: frame [34] · 0\.1\d s · (OK|LOST) · \d\.\d\d cm", document.text)
+    assert re.search(r"6 cursors: frame [34] · 0\.1\d s · (OK|LOST) · \d\.\d\d cm", document.text)
     assert "overflow 0" in document.text
 
 

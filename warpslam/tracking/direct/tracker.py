@@ -932,13 +932,16 @@ class DirectTracker:
         self._second.depth_sigma = state.depth_sigma
         self._typical_scale, self._typical_cost = state.typical
         self._build_missing()  # first, lest it displace the frame before
+        motion = FrameMotion.from_array(state.motion)
+        if current is not None:
+            self._motions[current] = motion
         if state.before < 0:
             return
         keyframe = next((one for one in reversed(self.keyframes) if one.index == state.before), None)
         if state.before == current:
             rgb, units, scale = self.images.current()
             self._upload(state.before, rgb, units, scale)
-            self._set_motion(state.before, FrameMotion.from_array(state.motion))
+            self._set_motion(state.before, motion)
         elif keyframe is not None:
             rgb, units, scale = self.images.kept(keyframe.image).unpack(self.camera)
         else:
