@@ -37,7 +37,7 @@ def test_tables(bench):
     assert [row["ATE RMSE [cm] mean"] for row in rows] == ["2", ""]
     assert [(row["finished"], row["ATE RMSE [cm] values"]) for row in rows] == [("2", "2"), ("0", "0")]
     content = read_json(bench.folder / "bench.json")
-    assert content["runs"] == {"finished": 4, "failed": 2} and content["spec"]["seeds"] == [0, 1]
+    assert content["runs"] == {"finished": 6, "failed": 2} and content["spec"]["seeds"] == [0, 1]
     assert content["studies"][1]["rows"][1]["figures"]["ate"]["values"] == pytest.approx([31.0, 33.0])
     for study in ("tracking", "color"):
         assert (bench.folder / f"{study}.png").read_bytes().startswith(b"\x89PNG")

@@ -351,8 +351,9 @@ def test_command_line(monkeypatch, tmp_path, capsys):
     files = [str(tmp_path / "p.json"), str(tmp_path / "t.json")]
     assert cli.main([*arguments, "--json", files[0], "--trace", files[1]]) == 0
     out = capsys.readouterr().out
-    assert "tracking / optimize" in out and "middle_forward" in out and files[1] in out
-    assert {"setup", "reading", "meshing"} <= {
-        row["phase"] for row in json.loads((tmp_path / "p.json").read_text())["phases"]
-    }
+    assert "tracking" in out and "middle_forward" in out and files[1] in out
+    report = json.loads((tmp_path / "p.json").read_text())
+    assert {"setup", "reading", "tracking", "meshing"} <= {row["phase"] for row in report["phases"]}
+    kernels = {(row["kernel"], row["phase"]) for row in report["kernels"]}
+    assert {("register", "tracking"), ("register_jointly", "tracking")} <= kernels
     assert json.loads((tmp_path / "t.json").read_text())["traceEvents"]
