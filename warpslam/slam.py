@@ -526,6 +526,8 @@ class Slam:
         slam._current, slam._mapped, slam._digest = state.current, state.mapped, state.digest
         if slam.direct is not None:
             slam.direct = direct = slam._direct_tracker()
+            if direct is not None and localize_only:
+                direct.fixed = len(slam.keyframes)
             if direct is not None and state.direct is not None:
                 direct.restore(state.direct, state.current)
         return slam

@@ -175,6 +175,19 @@ def test_saved_and_loaded_it_goes_on_alike(tmp_path):
         np.testing.assert_array_equal(loaded.trajectory.poses, whole.trajectory.poses)
 
 
+def test_a_map_that_is_only_looked_at_stays(tmp_path):
+    """Its keyframes keep their poses while the camera goes where none of them is."""
+    slam, path = tracker(), poses(22)
+    track(slam, path[:10])
+    write_slam(tmp_path / "map", slam.state())
+    looking = Slam.load(tmp_path / "map", "cpu", localize_only=True)
+    before = [keyframe.pose.copy() for keyframe in looking.keyframes]
+    results = track(looking, path[8:])
+    assert results[-1].status is FrameStatus.OK and len(looking.keyframes) > len(before)
+    for keyframe, pose in zip(looking.keyframes, before, strict=False):
+        np.testing.assert_array_equal(keyframe.pose, pose)
+
+
 def test_given_poses_start_a_trajectory():
     """The first pose is taken as it is given, and so is one after the camera was forgotten."""
     slam, path = tracker(), poses(4)

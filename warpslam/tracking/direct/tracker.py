@@ -237,6 +237,8 @@ class DirectTracker:
         self._rivals: list[Attempt] = []
         self._rotations = rotation_grid(config.search_span)
         self._second = SecondWitness(camera, device, max_depth, keyframes, images)
+        self.fixed = 0
+        """Keyframes, the first ones, whose poses stay as they are: those of a map that is only looked at."""
         self.counts = {"sure": 0, "searched": 0}
 
     # -- what Slam asks ------------------------------------------------------------------------------------------
@@ -529,7 +531,8 @@ class DirectTracker:
         """At the reference, at the frame before, at older keyframes, until a pose is believed."""
         picture = self._picture(frame)
         if history.last_known is not None or self._found is not None:
-            poses = [*starts, *self._turned(row, starts)]
+            # The frame before is at no place that is not confirmed yet.
+            poses = [*starts, *(self._turned(row, starts) if self._found is None else [])]
             foretold = starts[0] if self._is_foretold else None
             found = self._search(row, self._reference, poses, foretold, None)
             is_near = self._is_foretold and best is not None and best.moved < NEAR_SHIFT
@@ -808,7 +811,10 @@ class DirectTracker:
         active = list(dict.fromkeys([newest, *near]))[: self.config.window]
         active += [k for k in range(newest - 1, -1, -1) if k not in active][: self.config.window - len(active)]
         active.sort()
-        members = [Pose(self._points_of(k), self._row(self.keyframes[k]), self.keyframes[k].pose) for k in active]
+        members = [
+            Pose(self._points_of(k), self._row(self.keyframes[k]), self.keyframes[k].pose, k < self.fixed)
+            for k in active
+        ]
         poses = refine_window(
             self.registrar,
             members,

@@ -32,12 +32,14 @@ class Pose:
     row: int
     """Of its images."""
     T_world_camera: np.ndarray
+    is_fixed: bool = False
+    """Whether it stays where it is."""
 
 
 def refine_window(
     registrar: Registrar, members: Sequence[Pose], level: int, grey: float, depth: float, iterations: int
 ) -> list[np.ndarray]:
-    """Poses (4, 4) of the members after refinement; the first stays where it is."""
+    """Poses (4, 4) of the members after refinement; the first, and those that are fixed, stay where they are."""
     poses = [member.T_world_camera.copy() for member in members]
     pairs = _overlapping(registrar, members)
     if not pairs:
@@ -71,9 +73,11 @@ def refine_window(
             b[j] -= q
         M = A.reshape(6 * count, 6 * count)
         M[np.diag_indices_from(M)] = 1.001 * M.diagonal() + 1.0
-        M[range(6), range(6)] += FIXED
+        fixed = [n for n, member in enumerate(members) if n == 0 or member.is_fixed]
+        for n in fixed:
+            M[range(6 * n, 6 * n + 6), range(6 * n, 6 * n + 6)] += FIXED
         steps = -np.linalg.solve(M, b.reshape(-1)).reshape(count, 6)
-        for k in range(1, count):
+        for k in (k for k in range(count) if k not in fixed):
             poses[k] = orthonormalized(poses[k] @ motion_of(np.clip(steps[k], -MAX_STEP, MAX_STEP)))
     return poses
 
