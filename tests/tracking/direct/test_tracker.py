@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import warp as wp
 
 from tests.tracking.direct.conftest import CAMERA, ROOM
 from warpslam import Slam
@@ -11,6 +12,7 @@ from warpslam.camera import FrameMotion, SensorTiming
 from warpslam.config import Config
 from warpslam.frames import FrameResult, FrameStatus
 from warpslam.poses import inverse, motion_between, motion_of, twist_of
+from warpslam.runtime.cores import slice_count
 from warpslam.slam_state import write_slam
 
 STEP = np.array([0.03, 0.005, 0.02, 0.004, -0.02, 0.003])
@@ -100,6 +102,20 @@ def test_a_place_found_again_is_confirmed_first():
     assert [result.status for result in back] == [FrameStatus.LOST] * 3 + [FrameStatus.OK] * 2
     assert "confirmed" in back[0].message
     assert errors(back[3:], again[3:])[:, 0].max() < 5e-3
+
+
+def test_a_frame_without_doubt_is_few_launches(monkeypatch):
+    """Eleven kernels, two of them in slices, and five reads of what they found."""
+    slam, path = tracker(), [motion_of(0.15 * n * STEP) for n in range(8)]
+    track(slam, path[:-1])
+    launches, reads = [], []
+    launch, read = wp.Launch.launch, wp.array.numpy
+    monkeypatch.setattr(wp.Launch, "launch", lambda self, *a, **k: launches.append(self) or launch(self, *a, **k))
+    monkeypatch.setattr(wp.array, "numpy", lambda self, *a, **k: reads.append(self) or read(self, *a, **k))
+    sure = slam.direct.counts["sure"]
+    slam.step(*take(path[-1]))
+    assert slam.direct.counts["sure"] == sure + 1
+    assert 0 < len(launches) <= 11 + 2 * (slice_count(slam.device) - 1) and 0 < len(reads) <= 5
 
 
 def test_fast_turns_are_found():

@@ -61,12 +61,14 @@ class Registrar:
         still["to_depth"] = np.eye(4)
         self._motions = wp.array(still, dtype=points.Motion, device=device)
         self._buffers: dict[str, wp.array] = {}
+        self._mean_depths: dict[int, float] = {}  # by row
 
     # -- images and points ---------------------------------------------------------------------------------------
 
     def load(self, row: int, rgb: wp.array, units: wp.array, scale: wp.array) -> None:
         """Build the pyramid of an image: uint8 (H, W, 3), uint16 (H, W), and metres per unit (1,)."""
         levels, last = self.plan.levels, self.plan.levels[-1]
+        self._mean_depths.pop(row, None)
 
         def base(first: int, stop: int, slot: int) -> list[Step]:
             inputs = [rgb, units, scale, self.plan.edge, self._levels, row, first, self._images]
@@ -116,10 +118,12 @@ class Registrar:
 
     def mean_depth(self, row: int) -> float:
         """Of the smallest level [m]; 1 where nothing has depth."""
-        first = int(self.plan.levels[-1]["first"])
-        depth = self._images.depth[row].numpy()[first:]
-        known = depth[depth > 0]
-        return float(known.mean()) if len(known) else 1.0
+        if row not in self._mean_depths:
+            first = int(self.plan.levels[-1]["first"])
+            depth = self._images.depth[row].numpy()[first:]
+            known = depth[depth > 0]
+            self._mean_depths[row] = float(known.mean()) if len(known) else 1.0
+        return self._mean_depths[row]
 
     # -- registration --------------------------------------------------------------------------------------------
 
