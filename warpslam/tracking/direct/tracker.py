@@ -69,6 +69,8 @@ SHIFT_PRICE = 0.02
 """Growth of the cost of a pose by each pixel that it is away from what was foretold."""
 VARIANCE_FACTOR = 50.0
 """Of the covariance: on rendered scenes, with noise and without, 90 to 99 % of true errors lie within two sigma."""
+MAX_SIGMA = 0.05
+"""Standard deviation [m] beyond which a direction is left open."""
 LEAST_COST = 0.5
 """A registration that costs less needs no comparison with others."""
 SEARCH_WIDE, SEARCH_DEEP = 6, 3
@@ -82,7 +84,7 @@ class Attempt:
     """A frame registered to a keyframe."""
 
     keyframe: int
-    """Number of the keyframe, or `BEFORE` for the frame before."""
+    """Its number."""
     T_frame_keyframe: np.ndarray
     """float64 (4, 4)."""
     exposure: np.ndarray
@@ -284,7 +286,11 @@ class DirectTracker:
             pose = self._pose_of(best)
             self._overlap = self._overlaps_at(row, pose)
             done = self._follow(row, best.keyframe, pose, frame, history, best)
-        self.note = done
+        why = self._why_doubted(done)
+        if why:
+            self._found = None
+            self._keep_before(history)
+            return self._lost(row, done.attempt, why, history)
         self._reference = done.attempt.keyframe
         pose = orthonormalized(self.keyframes[self._reference].pose @ inverse(done.T_frame_reference))
         if not history.was_known:
@@ -368,6 +374,16 @@ class DirectTracker:
         self._found = _Found(pose, motion, count)
         return f"found again, to be confirmed by the frames that follow ({count} of {CONFIRMATIONS})"
 
+    def _why_doubted(self, done: Followed) -> str:
+        """What speaks against a pose that fits; empty if nothing does."""
+        back, sigma = done.attempt.back, float(np.linalg.eigvalsh(done.covariance[:3, :3])[-1]) ** 0.5
+        # Not by grey values: thin lines are lost at this level.
+        if back is not None and back.agreement < self.config.lost_agreement:
+            return f"looked at from the frame, only {back.agreement:.0%} of the keyframe's depth agrees"
+        if not sigma < MAX_SIGMA:
+            return f"a direction is left open: the position is uncertain by {sigma:.2f} m"
+        return ""
+
     def _has_rival(self, pose: np.ndarray, attempt: Attempt) -> bool:
         """Whether another place fits the frame nearly as well."""
         for other in self._rivals:
@@ -399,7 +415,7 @@ class DirectTracker:
         history: FrameHistory,
         best: Attempt | None = None,
     ) -> Followed:
-        """Register to the reference from a pose, then to all keyframes of large overlap; one reading of the device.
+        """Register to the reference from a pose, then to all keyframes of large overlap, and look back.
 
         best: What the pose comes from: only the largest level is left to do.
         """
@@ -432,7 +448,9 @@ class DirectTracker:
         self._overlap = dict(zip(near, shares.numpy()[: len(near)].tolist(), strict=True))
         attempt = replace(self._attempt(reference, result), moved=self._shift(row, task[0]["T"], result["T"]))
         if best is not None:
-            attempt = replace(attempt, cost=best.cost, measures=best.measures, grey_scale=best.grey_scale)
+            attempt = replace(
+                attempt, cost=best.cost, measures=best.measures, grey_scale=best.grey_scale, moved=best.moved
+            )
         T, T_joint = (np.asarray(one["T"], np.float64) for one in (result, last))
         step, turn = motion_between(T_joint, T)
         if step > MAX_JOINT_STEP or turn > MAX_JOINT_TURN:
