@@ -137,8 +137,9 @@ class Slam:
             MapSizeError: The map would outgrow the memory set for it.
         """
         frame = self._admit(rgb, depth, timestamp, T_world_camera, depth_scale, depth_timestamp)
-        if self.direct is not None:
-            frame = self._check_new(frame)
+        digest = self._digest
+        if self.direct is not None and not frame.fault:
+            frame, digest = self._check_new(frame)
         if frame.fault:
             self.history.skip(frame.timestamp)
             return skipped(frame, self.history.last_pose)
@@ -147,6 +148,7 @@ class Slam:
         self._make_current(frame)
         located = self._locate(frame, account)  # Sec. 3.3, Eq. 11-12
         self.history.add(frame.timestamp, located)
+        self._digest = digest
         self._note_motion(frame)  # what is mapped and kept are images of one moment
         if located.status is FrameStatus.OK and self.config.mapping.enabled:
             is_keyframe = self._is_keyframe(frame)  # Sec. 3.4
@@ -239,13 +241,14 @@ class Slam:
             colored=self.direct is not None or max(config.tracking.color_weight, config.mapping.color_weight) > 0,
         )
 
-    def _check_new(self, frame: AdmittedFrame) -> AdmittedFrame:
-        """The frame, with a fault if its images are those of the frame before: noise makes those of a camera differ."""
-        if frame.fault:
-            return frame
+    def _check_new(self, frame: AdmittedFrame) -> tuple[AdmittedFrame, int]:
+        """The frame, with a fault if its images are those of the frame before (noise makes those of a camera differ);
+        and what they are known by.
+        """
         digest = zlib.crc32(frame.depth[::4].tobytes(), zlib.crc32(frame.rgb[::4].tobytes()))
-        is_old, self._digest = digest == self._digest, digest
-        return replace(frame, fault="its images are those of the frame before, to the bit") if is_old else frame
+        if digest == self._digest:
+            frame = replace(frame, fault="its images are those of the frame before, to the bit")
+        return frame, digest
 
     def _is_due(self, frame: AdmittedFrame) -> bool:
         return self.scene.is_empty or frame.index % self.config.mapping.every == 0

@@ -20,6 +20,7 @@ from tests.fakes import FakeSequence, FakeSlam, run_sequence
 from warpslam import cli
 from warpslam.config import Config
 from warpslam.errors import ConfigError, DatasetError, OutputError
+from warpslam.frames import FrameStatus
 from warpslam.pipeline import run as pipeline
 from warpslam.runs.folder import RunFolder
 from warpslam.runtime.kernel_cache import kernel_cache_errors
@@ -37,7 +38,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakeSlam]:
         def step(self, rgb, depth, timestamp=None, T_world_camera=None, *, depth_timestamp=None):
             result = super().step(rgb, depth, timestamp, T_world_camera)
             if result.index in self.skip or (T_world_camera is not None and np.isnan(T_world_camera).any()):
-                result.status, result.message = "SKIPPED", "no use"
+                result = self.results[-1] = dataclasses.replace(result, status=FrameStatus.SKIPPED, message="no use")
             return result
 
     monkeypatch.setattr(

@@ -112,16 +112,20 @@ def test_tum_without_poses(tmp_path):
     ("name", "focal"), [("tum_fr1_xyz", 517.3), ("rgbd_dataset_freiburg2_desk", 520.9), ("fr3_office", 535.4)]
 )
 def test_tum_camera_from_name(tmp_path, name, focal):
-    """TUM: the folder's name tells the camera; frames are resized to 512 x 384 and lose 8 pixels on each side."""
+    """TUM: the folder's name tells the camera. Frames lose the border that undistortion blackens; as the paper's code
+    takes them they are resized to 512 x 384 and lose 8 pixels on each side.
+    """
     folder = writers.write_tum(tmp_path / name, times=[], depth_times=[], pose_times=[1.0])
     for kind, image in (("rgb", np.zeros((480, 640, 3), np.uint8)), ("depth", np.full((480, 640), 5000, np.uint16))):
         writers.write_image(folder / kind / "1.png", image)
         (folder / f"{kind}.txt").write_text(f"1.0 {kind}/1.png\n")
     sequence = open_sequence(folder)
-    assert (sequence.intrinsics.width, sequence.intrinsics.height) == (496, 368)
-    assert sequence.intrinsics.fx == pytest.approx(focal * 0.8)
-    assert sequence[0].rgb.shape == (368, 496, 3) and sequence[0].depth.shape == (368, 496)
-    assert (sequence[0].depth == 1).all()
+    size = (640, 480) if name == "fr3_office" else (620, 460)
+    for frames, (width, height), scale in ((sequence, size, 1.0), (sequence.as_published(), (496, 368), 0.8)):
+        assert (frames.intrinsics.width, frames.intrinsics.height) == (width, height)
+        assert frames.intrinsics.fx == pytest.approx(focal * scale)
+        assert frames[0].rgb.shape == (height, width, 3) and frames[0].depth.shape == (height, width)
+        assert np.isin(frames[0].depth, [0, 1]).all() and (frames[0].depth == 1).mean() > 0.97
 
 
 def test_scannet(tmp_path):
