@@ -205,6 +205,7 @@ class Slam:
         keyframes.
         """
         self.history.break_off()
+        self._digest = None
 
     def _direct_tracker(self) -> DirectTracker | None:
         if self.config.tracking.optimizer != "direct" or self.config.tracking.use_given_poses:
