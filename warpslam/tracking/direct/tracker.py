@@ -68,7 +68,7 @@ NEAR_SHIFT = 2.0
 SHIFT_PRICE = 0.02
 """Growth of the cost of a pose by each pixel that it is away from what was foretold."""
 VARIANCE_FACTOR = 50.0
-"""Of the covariance: on rendered scenes, with noise and without, 90 to 99 % of true errors lie within two sigma."""
+"""Of the covariance: on seven rendered sequences 94 % of true errors lie within two sigma, 78 % on the worst."""
 MAX_SIGMA = 0.05
 """Standard deviation [m] beyond which a direction is left open."""
 LEAST_COST = 0.5
