@@ -23,7 +23,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol
 
 import numpy as np
 
@@ -32,37 +31,15 @@ from warpslam.cli.common import parse_frames, quiet_warp
 from warpslam.config import Config
 from warpslam.errors import InputError, WarpSlamError
 from warpslam.evaluation import ate
-from warpslam.frames import FrameResult, FrameStatus
+from warpslam.frames import FrameStatus
+from warpslam.pipeline.methods import Method
 from warpslam.poses import rotation_angles
 from warpslam.sequences import RgbdSequence, open_sequence
 from warpslam.slam import Slam
 from warpslam.synthetic import HARD_SCENES, AlteredSequence, altered, make_sequence, write_replica
-from warpslam.trajectory import Trajectory
 
 FALSE_STEP, FALSE_TURN = 0.10, 5.0  # [m], [deg]
 CAMERA = Intrinsics(525.0, 525.0, 319.5, 239.5, 640, 480)
-
-
-class Tracker(Protocol):
-    """What of `Slam` is used here."""
-
-    def step(
-        self,
-        rgb: Any,
-        depth: Any,
-        timestamp: float | None = None,
-        T_world_camera: np.ndarray | None = None,
-        *,
-        depth_timestamp: float | None = None,
-    ) -> FrameResult:
-        """Take in one frame."""
-
-    def finish(self) -> dict[str, float]:
-        """After the last frame."""
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """All poses."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +75,7 @@ class Figures:
     wall_seconds: float
 
 
-def drive(slam: Tracker, sequence: RgbdSequence) -> Drive:
+def drive(slam: Method, sequence: RgbdSequence) -> Drive:
     """Run all frames; the first one starts at its true pose where that is known."""
     online, status, cpu, wall = [], [], [], 0.0
     for index in range(len(sequence)):

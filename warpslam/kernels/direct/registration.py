@@ -21,6 +21,7 @@ from warpslam.kernels.direct.equations import (
     Vec16,
     Weights,
     depth_at,
+    depth_sigma,
     evaluate,
     exponential,
     inverted,
@@ -566,7 +567,7 @@ def overlaps(
                 v = level.fy * q[1] / q[2] + level.cy
                 if inside(u, v, level):
                     d = depth_at(images, row, level, u, v)
-                    s = 0.0012 + 0.0019 * (q[2] - 0.4) * (q[2] - 0.4)
+                    s = depth_sigma(q[2])
                     if d > 0.0 and wp.abs(d - q[2]) <= wp.max(6.0 * s, 0.02 * q[2]):
                         agree += 1.0
     shares[tid] = agree / wp.max(known, 1.0)

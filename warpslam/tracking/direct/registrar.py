@@ -15,6 +15,8 @@ from warpslam.tracking.direct.pyramid import PyramidPlan, records
 
 FIRST_KEYFRAMES = 16
 """Rows of points to begin with; they double as keyframes come."""
+OVERLAP_STRIDE = 2
+"""Every second point tells enough of an overlap."""
 
 
 @dataclass(frozen=True)
@@ -134,36 +136,16 @@ class Registrar:
     def start(self, tasks: np.ndarray) -> wp.array:
         """`register` without waiting; what it returns holds until the next call."""
         count = len(tasks)
-        on_device = self._array("tasks", registration.Task, count)
-        on_device[:count].assign(tasks)
         results = self._array("results", registration.Result, count)
-        histograms = self._histograms(count)
-
-        def steps(first: int, stop: int, slot: int) -> list[Step]:
-            inputs = [
-                self._levels,
-                self._iterations,
-                self._floors,
-                self._points,
-                self._images,
-                self._motions,
-                on_device,
-                first,
-                self.lanes,
-                histograms,
-                results,
-            ]
-            return [(registration.register, (stop - first) * self.lanes, inputs)]
-
-        self._launcher.slices(count, steps, whole=count == 1)
+        before = [self._levels, self._iterations, self._floors, self._points, self._images, self._motions]
+        before.append(self._upload("tasks", registration.Task, tasks))
+        self._by_groups(registration.register, count, before, results)
         return results
 
     def join(self, start: wp.array, joint: np.ndarray, to_reference: np.ndarray) -> wp.array:
         """A `registration.Joint` from the pose of ``start`` on, without waiting; its `registration.Result` (1,)."""
-        joints = self._array("joints", registration.Joint, 1)
-        joints.assign(joint.reshape(1))
-        matrices = self._array("to_reference", wp.mat44, registration.MAX_JOINT)
-        matrices[: len(to_reference)].assign(to_reference.astype(np.float32))
+        joints = self._upload("joints", registration.Joint, joint)
+        matrices = self._upload("to_reference", wp.mat44, to_reference.astype(np.float32))
         result = self._array("joined", registration.Result, 1)
         inputs = [
             self._levels,
@@ -188,10 +170,8 @@ class Registrar:
         keyframe to those of the reference, (keyframes, 4, 4).
         """
         count = len(keyframes)
-        numbers = self._array("numbers", wp.int32, count)
-        numbers[:count].assign(np.array(keyframes, np.int32))
-        matrices = self._array("matrices", wp.mat44, count)
-        matrices[:count].assign(to_reference.astype(np.float32))
+        numbers = self._upload("numbers", wp.int32, np.array(keyframes, np.int32))
+        matrices = self._upload("matrices", wp.mat44, to_reference.astype(np.float32))
         shares = self._array("shares", wp.float32, count)
         level = max(self.plan.top - 1, 0)
         inputs = [
@@ -214,39 +194,18 @@ class Registrar:
         """The same for transforms that are known: (keyframes, 4, 4), from each keyframe's axes to the frame's."""
         if not len(keyframes):
             return np.zeros(0)
-        still = self._array("identity", registration.Result, 1)
         identity = records(registration.Result)
         identity["T"] = np.eye(4)
-        still.assign(identity)
+        still = self._upload("identity", registration.Result, identity)
         return np.array(self.overlaps(row, still, keyframes, T_frame_keyframe).numpy()[: len(keyframes)])
 
     def pairs(self, level: int, pairs: np.ndarray, grey: float, depth: float) -> np.ndarray:
         """Normal equations of `registration.Pair`s at a level, one `registration.PairSums` each."""
         count = len(pairs)
-        on_device = self._array("pairs", registration.Pair, count)
-        on_device[:count].assign(pairs)
         sums = self._array("sums", registration.PairSums, count)
-        histograms = self._histograms(count)
-
-        def steps(first: int, stop: int, slot: int) -> list[Step]:
-            inputs = [
-                self._levels,
-                level,
-                grey,
-                depth,
-                self._floors,
-                self._points,
-                self._images,
-                self._motions,
-                on_device,
-                first,
-                self.lanes,
-                histograms,
-                sums,
-            ]
-            return [(registration.sum_pairs, (stop - first) * self.lanes, inputs)]
-
-        self._launcher.slices(count, steps, whole=count == 1)
+        before = [self._levels, level, grey, depth, self._floors, self._points, self._images, self._motions]
+        before.append(self._upload("pairs", registration.Pair, pairs))
+        self._by_groups(registration.sum_pairs, count, before, sums)
         return np.array(sums.numpy()[:count])
 
     def rotations(self, smallest: np.ndarray, row: int, candidates: np.ndarray) -> np.ndarray:
@@ -256,8 +215,7 @@ class Registrar:
         known = self._buffers.get("rotations")
         if known is None:
             known = self._buffers["rotations"] = wp.array(candidates, dtype=wp.mat33, device=self.device)
-        keys = self._array("smallest", wp.float32, len(smallest), smallest.shape[1])
-        keys[: len(smallest)].assign(smallest)
+        keys = self._upload("smallest", wp.float32, smallest)
         scores = self._array("scores", wp.float32, len(smallest), len(candidates))
         inputs = [self._levels, keys, self._images, row, known, scores]
         self._launcher.launch(registration.search_rotations, (len(smallest), len(candidates)), inputs)
@@ -272,6 +230,21 @@ class Registrar:
             size = max(count, 2 * found.shape[0] if found is not None else 0)
             found = self._buffers[name] = wp.zeros((size, *more), dtype=dtype, device=self.device)
         return found
+
+    def _upload(self, name: str, dtype: type, values: np.ndarray) -> wp.array:
+        """A buffer that begins with ``values``; those of a struct or a matrix are one to an entry."""
+        array = self._array(name, dtype, len(values), *(values.shape[1:] if dtype is wp.float32 else ()))
+        array[: len(values)].assign(values)
+        return array
+
+    def _by_groups(self, kernel: wp.Kernel, count: int, before: list[Any], results: wp.array) -> None:
+        """Launch a kernel whose every result takes a group of threads."""
+        histograms = self._histograms(count)
+
+        def steps(first: int, stop: int, slot: int) -> list[Step]:
+            return [(kernel, (stop - first) * self.lanes, [*before, first, self.lanes, histograms, results])]
+
+        self._launcher.slices(count, steps, whole=count == 1)
 
     def _histograms(self, count: int) -> wp.array:
         return self._array("histograms", wp.int32, count, 2 * equations.BINS)
@@ -290,17 +263,6 @@ class Registrar:
         for name in ("position", "normal", "grey"):
             wp.copy(getattr(new, name), getattr(old, name), count=getattr(old, name).size)
         self._points = new
-
-    @property
-    def device_bytes(self) -> int:
-        """Memory of images and points."""
-        arrays = (self._images.grey, self._images.shades, self._images.depth)
-        kept = (self._points.position, self._points.normal, self._points.grey)
-        return sum(array.capacity for array in arrays + kept)
-
-
-OVERLAP_STRIDE = 2
-"""Every second point tells enough of an overlap."""
 
 
 def new_tasks(count: int) -> Any:

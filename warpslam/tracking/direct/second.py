@@ -29,6 +29,11 @@ class Picture:
     depth: np.ndarray
     """float32 (H, W) [m]."""
 
+    @classmethod
+    def of(cls, rgb: np.ndarray, units: np.ndarray, scale: float) -> Picture:
+        """From an image as the pool keeps it: depth in uint16, and metres per unit."""
+        return cls(rgb, units.astype(np.float32) * np.float32(scale))
+
     @property
     def grey(self) -> np.ndarray:
         """uint8 (H, W)."""
@@ -92,7 +97,6 @@ class SecondWitness:
     def _learn(self, keyframes: Sequence[int]) -> None:
         for number in keyframes:
             if number not in self._known:
-                rgb, units, scale = self.images.kept(self.keyframes[number].image).unpack(self.camera)
-                picture = Picture(rgb, units.astype(np.float32) * np.float32(scale))
+                picture = Picture.of(*self.images.kept(self.keyframes[number].image).unpack(self.camera))
                 self._witness.add_keyframe(number, self._features(picture))
                 self._known.add(number)

@@ -43,8 +43,8 @@ NEAR_KEYFRAMES = 24
 """Keyframes, the nearest by pose, whose overlap is looked at."""
 DEGREE = 0.02
 """Metres that a degree counts for when keyframes are ordered by nearness."""
-MAX_JOINT_STEP, MAX_JOINT_TURN = 0.1, 5.0
-"""Further than this [m], [degrees] the joint registration must not take a pose."""
+SAME_STEP, SAME_TURN = 0.1, 5.0
+"""Poses further apart [m], [degrees] are two places; the joint registration must not take a frame to another."""
 BRIDGE = 5
 """Frames without a pose over which constant speed is still believed."""
 MAX_GAP = 10
@@ -161,10 +161,7 @@ class _Before:
     @property
     def picture(self) -> Picture:
         """The frame as it comes back from a file."""
-        if self.kept is None:
-            return Picture(self.rgb, self.depth)
-        rgb, units, scale = self.kept
-        return Picture(rgb, units.astype(np.float32) * np.float32(scale))
+        return Picture(self.rgb, self.depth) if self.kept is None else Picture.of(*self.kept)
 
 
 @dataclass(frozen=True)
@@ -386,13 +383,12 @@ class DirectTracker:
 
     def _has_rival(self, pose: np.ndarray, attempt: Attempt) -> bool:
         """Whether another place fits the frame nearly as well."""
-        for other in self._rivals:
-            step, turn = motion_between(pose, self._pose_of(other))
-            is_elsewhere = step > MAX_JOINT_STEP or turn > MAX_JOINT_TURN
-            fits = other.measures.agreement > FOUND_AGREEMENT and other.cost < UNIQUE * attempt.cost
-            if is_elsewhere and fits:
-                return True
-        return False
+        return any(
+            other.measures.agreement > FOUND_AGREEMENT
+            and other.cost < UNIQUE * attempt.cost
+            and _is_elsewhere(pose, self._pose_of(other))
+            for other in self._rivals
+        )
 
     # -- registration --------------------------------------------------------------------------------------------
 
@@ -452,8 +448,7 @@ class DirectTracker:
                 attempt, cost=best.cost, measures=best.measures, grey_scale=best.grey_scale, moved=best.moved
             )
         T, T_joint = (np.asarray(one["T"], np.float64) for one in (result, last))
-        step, turn = motion_between(T_joint, T)
-        if step > MAX_JOINT_STEP or turn > MAX_JOINT_TURN:
+        if _is_elsewhere(T_joint, T):
             T_joint = T
         attempt = replace(attempt, back=self._measure_back(row, reference, T_joint))
         seen = Measures.of(result["record_0"])
@@ -502,7 +497,7 @@ class DirectTracker:
 
     def _depth_error(self, row: int, attempt: Attempt) -> float:
         """Spread of depth against the keyframe [m]."""
-        return attempt.depth_scale * depth_sigma(self.registrar.mean_depth(row))
+        return attempt.depth_scale * float(eq.depth_sigma(self.registrar.mean_depth(row)))
 
     def _is_sure(self, attempt: Attempt) -> bool:
         """Whether nothing needs to be searched for."""
@@ -552,7 +547,7 @@ class DirectTracker:
             # The frame before is at no place that is not confirmed yet.
             poses = [*starts, *(self._turned(row, starts) if self._found is None else [])]
             foretold = starts[0] if self._is_foretold else None
-            found = self._search(row, self._reference, poses, foretold, None)
+            found = self._search(row, self._reference, poses, foretold)
             is_near = self._is_foretold and best is not None and best.moved < NEAR_SHIFT
             if best is None or not self._is_good(best) or not is_near:
                 best = _better(best, found, by_cost=True)
@@ -567,7 +562,7 @@ class DirectTracker:
             before = self._before
             if history.was_known and before is not None and before.index != self._reference_frame:
                 self._keep_before(history)
-                best = _better(best, self._search(row, self._reference, poses, foretold, None))
+                best = _better(best, self._search(row, self._reference, poses, foretold))
                 best = self._judge(row, best, witness)
                 if best is not None and self._is_good(best):
                     return best
@@ -577,8 +572,7 @@ class DirectTracker:
         """The frame as it comes back from a file."""
         if not self.device.is_cpu:
             return Picture(frame.rgb, frame.depth)
-        rgb, units, scale = self.images.current()
-        return Picture(rgb, units.astype(np.float32) * np.float32(scale))
+        return Picture.of(*self.images.current())
 
     def _ask(self, picture: Picture, history: FrameHistory, foretold: np.ndarray) -> Witness | None:
         """What features say, if the frame follows one whose pose is known."""
@@ -612,7 +606,7 @@ class DirectTracker:
         before = self._row_before()
         if before is None or not starts:
             return []
-        rotations = self._best_rotations(self.registrar.smallest(before)[None], row, self.config.search_kept)[0]
+        rotations = self._best_rotations(before, row)
         last = starts[-1]
         shift = inverse(last) @ starts[0]
         poses = []
@@ -626,20 +620,17 @@ class DirectTracker:
                 poses.append(last @ turn)
         return poses
 
-    def _best_rotations(self, smallest: np.ndarray, row: int, count: int) -> list[list[np.ndarray]]:
-        """For each of some images the rotations into the frame that fit best and differ by more than 5 degrees."""
-        scores = self.registrar.rotations(smallest, row, self._rotations)
-        out = []
-        for line in scores:
-            found: list[np.ndarray] = []
-            for n in np.argsort(line, kind="stable")[:40]:
-                R = self._rotations[n]
-                if all(np.trace(R.T @ other) < 1.0 + 2.0 * np.cos(np.radians(5.0)) for other in found):
-                    found.append(R)
-                if len(found) == count:
-                    break
-            out.append(found)
-        return out
+    def _best_rotations(self, before: int, row: int) -> list[np.ndarray]:
+        """Rotations from one frame into another that fit best and differ by more than 5 degrees."""
+        (scores,) = self.registrar.rotations(self.registrar.smallest(before)[None], row, self._rotations)
+        found: list[np.ndarray] = []
+        for n in np.argsort(scores, kind="stable")[:40]:
+            R = self._rotations[n]
+            if all(np.trace(R.T @ other) < 1.0 + 2.0 * np.cos(np.radians(5.0)) for other in found):
+                found.append(R)
+            if len(found) == self.config.search_kept:
+                break
+        return found
 
     def _search(
         self,
@@ -647,7 +638,6 @@ class DirectTracker:
         keyframe: int,
         poses: Sequence[np.ndarray],
         foretold: np.ndarray | None,
-        best: Attempt | None,
     ) -> Attempt | None:
         """The cheapest of many starts: each as it is and after the smallest levels, the best three refined.
 
@@ -674,6 +664,7 @@ class DirectTracker:
         chosen = _apart(sorted(refined, key=lambda one: one[0]), SEARCH_DEEP)
         tasks = self._refinements(row, points_row, chosen)
         tasks["top"], tasks["low"], tasks["cost_level"] = min(self.judged, middle), 0, 0
+        best: Attempt | None = None
         for result in self.registrar.register(tasks) if len(tasks) else ():
             found = self._attempt(keyframe, result)
             if foretold is not None:
@@ -734,22 +725,22 @@ class DirectTracker:
             near = self._nearest(witness.T_world_camera)
             overlap = self._overlaps_at(row, witness.T_world_camera)
             keyframe = max(near, key=lambda k: overlap[k])
-            attempt = self._search(row, keyframe, [witness.T_world_camera], None, None)
+            attempt = self._search(row, keyframe, [witness.T_world_camera], None)
             if attempt is not None:
                 found.append(replace(attempt, moved=np.inf))
         for n in order[:4]:
             keyframe = numbers[n]
             turn = np.eye(4)
             turn[:3, :3] = self._rotations[scores[n].argmin()].T
-            attempt = self._search(row, keyframe, [self.keyframes[keyframe].pose @ turn], None, None)
+            attempt = self._search(row, keyframe, [self.keyframes[keyframe].pose @ turn], None)
             if attempt is not None:
                 found.append(replace(attempt, moved=np.inf))
         best = max(found, key=lambda attempt: attempt.measures.worth, default=None)
         if best is None or not self._is_good(best):
             return best
+        place = self._pose_of(best)
         for other in found:
-            step, turn_angle = motion_between(self._pose_of(best), self._pose_of(other))
-            is_elsewhere = step > MAX_JOINT_STEP or turn_angle > MAX_JOINT_TURN
+            is_elsewhere = _is_elsewhere(place, self._pose_of(other))
             if is_elsewhere and self._is_good(other) and other.cost < UNIQUE * best.cost:
                 return replace(best, ok=False)
         return best
@@ -1073,13 +1064,14 @@ def _better(a: Attempt | None, b: Attempt | None, *, by_cost: bool = False) -> A
     return b if b.measures.worth > a.measures.worth else a
 
 
+def _is_elsewhere(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two poses are two places."""
+    step, turn = motion_between(a, b)
+    return bool(step > SAME_STEP or turn > SAME_TURN)
+
+
 def _running(mean: float, value: float) -> float:
     return value if not np.isfinite(mean) else 0.9 * mean + 0.1 * value
-
-
-def depth_sigma(z: float) -> float:
-    """Standard deviation of a structured-light sensor's depth at a distance [m], [m]."""
-    return float(0.0012 + 0.0019 * (z - 0.4) ** 2)
 
 
 def covariance_of(H: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics
+from warpslam.poses import orthonormalized
 from warpslam.tracking.features.detection import DEPTH_STRIDE, FeatureFrame, depth_at
 from warpslam.tracking.features.device import FEATURE, DeviceFrame, FoundPose, PoseFinder
 from warpslam.tracking.features.pairs import descriptor_pairs, flow_pairs, ransac_pose
@@ -122,7 +123,7 @@ class FeatureWitness:
         Returns:
             None if features do not tell.
         """
-        reference = _rigid(previous[2] if predicted is None else predicted)
+        reference = orthonormalized(previous[2] if predicted is None else predicted)
         by, found = self._follow(frame, grey, previous, reference)
         local = [number for number in candidates if number in self._keyframes][: self.settings.local_keyframes]
         if found is None:
@@ -317,7 +318,7 @@ class FeatureWitness:
         by: str,
         by_keyframes: bool,
     ) -> Witness:
-        pose = _rigid(reference @ np.linalg.inv(found.T_camera_reference))
+        pose = orthonormalized(reference @ np.linalg.inv(found.T_camera_reference))
         mine, others = self._device_frame(frame), self._device_frame(other)
         agreement, compared = self._finder.agreement(mine, others, T_other_world @ pose)
         return Witness(pose, found.inliers, found.matches, agreement, compared, found.H, by, by_keyframes)
@@ -353,11 +354,3 @@ class FeatureRows:
         """
         T = np.linalg.inv(T_world_camera) @ self._T_world_reference
         return self._finder.evaluate(self._frame.features, self._frame.motion, T, self._depth_sigma)
-
-
-def _rigid(T: np.ndarray) -> np.ndarray:
-    """The transform (4, 4), float64, with its rotation made one to the last digits: products of many drift off."""
-    U, _, Vt = np.linalg.svd(T[:3, :3])
-    result = np.array(T, dtype=np.float64)
-    result[:3, :3] = U @ Vt
-    return result
