@@ -17,6 +17,7 @@ from warpslam.kernels.direct.equations import (
     POINTS,
     Mat66,
     Mat88,
+    Vec6,
     Vec8,
     Vec16,
     Weights,
@@ -339,6 +340,19 @@ class Joint:
     """Of the depth image against the colour image [s]."""
     readout: float
     """[s]"""
+    others: int
+    """Of the `OtherRows` that join."""
+
+
+@wp.struct
+class OtherRows:
+    """Normal equations of a pose from elsewhere (features, the map), which join those of the keyframes."""
+
+    T: wp.mat44
+    """From the reference's axes to the frame's, where they hold."""
+    H: Mat66
+    """Of T <- exp(xi) T; residuals in units of their standard deviation."""
+    g: Vec6
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
@@ -350,6 +364,7 @@ def register_jointly(
     motions: wp.array[Motion],
     joints: wp.array[Joint],
     to_reference: wp.array[wp.mat44],
+    others: wp.array[OtherRows],
     start: wp.array[Result],
     lanes: int,
     histograms: wp.array2d[int],
@@ -430,6 +445,14 @@ def register_jointly(
             k += 1
             begins = done == 0
             if k == joint.count:
+                for m in range(joint.others):
+                    other = others[m]
+                    moved_by = logarithm(T * inverted(other.T))
+                    step = other.g + other.H * moved_by
+                    for i in range(6):
+                        for j in range(6):
+                            A[i, j] += other.H[i, j]
+                        g[i] += step[i]
                 for i in range(6):
                     for j in range(6):
                         result.H[i, j] = A[i, j]

@@ -142,8 +142,15 @@ class Registrar:
         self._by_groups(registration.register, count, before, results)
         return results
 
-    def join(self, start: wp.array, joint: np.ndarray, to_reference: np.ndarray) -> wp.array:
-        """A `registration.Joint` from the pose of ``start`` on, without waiting; its `registration.Result` (1,)."""
+    def join(
+        self, start: wp.array, joint: np.ndarray, to_reference: np.ndarray, others: np.ndarray | None = None
+    ) -> wp.array:
+        """A `registration.Joint` from the pose of ``start`` on, without waiting; its `registration.Result` (1,).
+
+        others: `registration.OtherRows` that join.
+        """
+        if others is None:
+            others = records(registration.OtherRows)
         joints = self._upload("joints", registration.Joint, joint)
         matrices = self._upload("to_reference", wp.mat44, to_reference.astype(np.float32))
         result = self._array("joined", registration.Result, 1)
@@ -155,6 +162,7 @@ class Registrar:
             self._motions,
             joints,
             matrices,
+            self._upload("others", registration.OtherRows, others),
             start,
             self.lanes,
             self._histograms(1),
