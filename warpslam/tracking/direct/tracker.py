@@ -25,6 +25,7 @@ from warpslam.kernels.direct import points, registration
 from warpslam.poses import inverse, motion_between, motion_of, orthonormalized, twist_of
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
+from warpslam.tracking.direct.aliases import difference_elsewhere
 from warpslam.tracking.direct.measures import Measures
 from warpslam.tracking.direct.pyramid import PyramidPlan, records
 from warpslam.tracking.direct.registrar import Floors, Registrar, new_tasks
@@ -57,6 +58,10 @@ CONFIRMATIONS = 3
 """Frames that must follow before a place found again is believed."""
 UNIQUE = 1.5
 """Another place that costs less than this multiple of the best is as likely."""
+TELLING = 0.7
+"""What a frame must differ from itself elsewhere, as a mean robust cost; a plain tiled wall has 0.2 to 0.6, one with
+pictures on it 0.9 and more.
+"""
 WITNESS_KEYFRAMES = 3
 """Keyframes whose features a frame is matched with."""
 DIFFERENT_STEP, DIFFERENT_TURN = 0.03, 1.5
@@ -291,7 +296,7 @@ class DirectTracker:
         self._reference = done.attempt.keyframe
         pose = orthonormalized(self.keyframes[self._reference].pose @ inverse(done.T_frame_reference))
         if not history.was_known:
-            why = self._confirm(frame, pose, done.attempt, history)
+            why = self._confirm(row, pose, done.attempt, history)
             if why:
                 return replace(self._located(pose, done, history), why_lost=why, after_loss=False)
         return self._accept(row, frame, pose, done, history)
@@ -342,7 +347,7 @@ class DirectTracker:
             covariance=done.covariance,
         )
 
-    def _confirm(self, frame: AdmittedFrame, pose: np.ndarray, attempt: Attempt, history: FrameHistory) -> str:
+    def _confirm(self, row: int, pose: np.ndarray, attempt: Attempt, history: FrameHistory) -> str:
         """Why a pose that was found after a loss can't be believed yet; empty if it can.
 
         One that is near where the camera was lost a moment ago needs no more than any other. Elsewhere the place must
@@ -351,7 +356,7 @@ class DirectTracker:
         last = history.last_known
         gap = MAX_GAP + 1 if last is None else len(history) - last
         is_near = self._is_foretold and attempt.moved < NEAR_SHIFT
-        if not is_near and self._has_rival(pose, attempt):
+        if not is_near and self._has_rival(row, pose, attempt):
             self._found = None
             return "two places look alike from here"
         if gap <= MAX_GAP and not history.is_jump(pose, *MAX_MOTION):
@@ -381,14 +386,14 @@ class DirectTracker:
             return f"a direction is left open: the position is uncertain by {sigma:.2f} m"
         return ""
 
-    def _has_rival(self, pose: np.ndarray, attempt: Attempt) -> bool:
-        """Whether another place fits the frame nearly as well."""
-        return any(
-            other.measures.agreement > FOUND_AGREEMENT
-            and other.cost < UNIQUE * attempt.cost
-            and _is_elsewhere(pose, self._pose_of(other))
-            for other in self._rivals
-        )
+    def _has_rival(self, row: int, pose: np.ndarray, attempt: Attempt) -> bool:
+        """Whether the frame may be at another place as well."""
+        for other in self._rivals:
+            is_alike = other.measures.agreement > FOUND_AGREEMENT and other.cost < UNIQUE * attempt.cost
+            if is_alike and _is_elsewhere(pose, self._pose_of(other)):
+                return True
+        weights = self.config.grey_weight, self.config.depth_weight
+        return difference_elsewhere(self.registrar, row, SCRATCH, weights, SAME_STEP) < TELLING
 
     # -- registration --------------------------------------------------------------------------------------------
 
