@@ -561,6 +561,12 @@ def sum_pairs(
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
+def look_back(pose: wp.array[Result], pairs: wp.array[Pair]):
+    """Give a pair the inverse of a pose."""
+    pairs[0].T = inverted(pose[0].T)
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
 def overlaps(
     levels: wp.array[Level],
     n: int,

@@ -15,6 +15,10 @@ from warpslam.tracking.direct.pyramid import PyramidPlan, records
 
 FIRST_KEYFRAMES = 16
 """Rows of points to begin with; they double as keyframes come."""
+MOST_NEAR = 24
+"""Keyframes whose overlap with a frame is asked for at once."""
+ALIGNED = 64
+"""Bytes that a part of a buffer begins at a multiple of."""
 OVERLAP_STRIDE = 2
 """Every second point tells enough of an overlap."""
 
@@ -33,6 +37,20 @@ class Floors:
         struct = registration.Floors()
         struct.grey, struct.depth = self.grey, self.depth
         return struct
+
+
+@dataclass(frozen=True)
+class FollowedRecords:
+    """What `Registrar.follow` finds."""
+
+    result: np.ndarray
+    """`registration.Result` of the reference alone."""
+    joined: np.ndarray
+    """That of all keyframes."""
+    shares: np.ndarray
+    """Of the keyframes near by, float32 (near,)."""
+    back: np.ndarray
+    """`registration.PairSums` of the reference in the frame's points."""
 
 
 class Registrar:
@@ -64,6 +82,8 @@ class Registrar:
         self._motions = wp.array(still, dtype=points.Motion, device=device)
         self._buffers: dict[str, wp.array] = {}
         self._mean_depths: dict[int, float] = {}  # by row
+        last = plan.levels[-1]
+        self._report = _Report(int(last["width"] * last["height"]), device)
 
     # -- images and points ---------------------------------------------------------------------------------------
 
@@ -122,10 +142,12 @@ class Registrar:
         """Of the smallest level [m]; 1 where nothing has depth."""
         if row not in self._mean_depths:
             first = int(self.plan.levels[-1]["first"])
-            depth = self._images.depth[row].numpy()[first:]
-            known = depth[depth > 0]
-            self._mean_depths[row] = float(known.mean()) if len(known) else 1.0
+            self._note_mean_depth(row, self._images.depth[row].numpy()[first:])
         return self._mean_depths[row]
+
+    def _note_mean_depth(self, row: int, smallest: np.ndarray) -> None:
+        known = smallest[smallest > 0]
+        self._mean_depths[row] = float(known.mean()) if len(known) else 1.0
 
     # -- registration --------------------------------------------------------------------------------------------
 
@@ -133,17 +155,23 @@ class Registrar:
         """Run `registration.Task`s side by side; one `registration.Result` each."""
         return np.array(self.start(tasks).numpy()[: len(tasks)])
 
-    def start(self, tasks: np.ndarray) -> wp.array:
+    def start(self, tasks: np.ndarray, results: wp.array | None = None) -> wp.array:
         """`register` without waiting; what it returns holds until the next call."""
         count = len(tasks)
-        results = self._array("results", registration.Result, count)
+        if results is None:
+            results = self._array("results", registration.Result, count)
         before = [self._levels, self._iterations, self._floors, self._points, self._images, self._motions]
         before.append(self._upload("tasks", registration.Task, tasks))
         self._by_groups(registration.register, count, before, results)
         return results
 
     def join(
-        self, start: wp.array, joint: np.ndarray, to_reference: np.ndarray, others: np.ndarray | None = None
+        self,
+        start: wp.array,
+        joint: np.ndarray,
+        to_reference: np.ndarray,
+        others: np.ndarray | None = None,
+        result: wp.array | None = None,
     ) -> wp.array:
         """A `registration.Joint` from the pose of ``start`` on, without waiting; its `registration.Result` (1,).
 
@@ -153,7 +181,8 @@ class Registrar:
             others = records(registration.OtherRows)
         joints = self._upload("joints", registration.Joint, joint)
         matrices = self._upload("to_reference", wp.mat44, to_reference.astype(np.float32))
-        result = self._array("joined", registration.Result, 1)
+        if result is None:
+            result = self._array("joined", registration.Result, 1)
         inputs = [
             self._levels,
             self._floors,
@@ -171,7 +200,53 @@ class Registrar:
         self._launcher.launch(registration.register_jointly, self.lanes, inputs)
         return result
 
-    def overlaps(self, row: int, pose: wp.array, keyframes: Sequence[int], to_reference: np.ndarray) -> wp.array:
+    def follow(
+        self,
+        task: np.ndarray,
+        joint: np.ndarray,
+        joint_to_reference: np.ndarray,
+        near: Sequence[int],
+        near_to_reference: np.ndarray,
+        back: np.ndarray,
+        others: np.ndarray | None = None,
+    ) -> FollowedRecords:
+        """Register to the reference, from there to several keyframes at once, see which others overlap, and look back;
+        all of it is read at once.
+
+        Args:
+            task: A `registration.Task`.
+            joint: A `registration.Joint`.
+            joint_to_reference: From the axes of its keyframes to those of the reference, (count, 4, 4).
+            near: Keyframes whose overlap is asked for.
+            near_to_reference: The same for these, (near, 4, 4).
+            back: A `registration.Pair`, from the frame's points, which are chosen here, to the reference; its pose is
+                filled in: the inverse of the joint one.
+            others: `registration.OtherRows` that join.
+        """
+        row = int(joint["row"][0])
+        report = self._report
+        started = self.start(task, report.started)
+        joined = self.join(started, joint, joint_to_reference, others, report.joined)
+        self.overlaps(row, joined, near, near_to_reference, report.shares)
+        pairs = self._upload("back", registration.Pair, back)
+        self._launcher.launch(registration.look_back, 1, [joined, pairs])
+        level = self.plan.middle
+        self.select(row, int(back["keyframe"][0]), level)
+        self._sum_pairs(level, 1, pairs, float(task["grey"][0]), float(task["depth"][0]), report.back)
+        first = int(self.plan.levels[-1]["first"])
+        wp.copy(report.depth, self._images.depth[row], src_offset=first, count=report.depth.size)
+        found = report.read()
+        self._note_mean_depth(row, found["depth"])
+        return FollowedRecords(found["started"][0], found["joined"][0], found["shares"][: len(near)], found["back"][0])
+
+    def overlaps(
+        self,
+        row: int,
+        pose: wp.array,
+        keyframes: Sequence[int],
+        to_reference: np.ndarray,
+        shares: wp.array | None = None,
+    ) -> wp.array:
         """Share of each keyframe's points that a frame sees at the depth expected, without waiting; (keyframes,).
 
         pose: `registration.Result`, from the reference's axes to the frame's. to_reference: from the axes of each
@@ -180,7 +255,8 @@ class Registrar:
         count = len(keyframes)
         numbers = self._upload("numbers", wp.int32, np.array(keyframes, np.int32))
         matrices = self._upload("matrices", wp.mat44, to_reference.astype(np.float32))
-        shares = self._array("shares", wp.float32, count)
+        if shares is None:
+            shares = self._array("shares", wp.float32, count)
         level = max(self.plan.top - 1, 0)
         inputs = [
             self._levels,
@@ -211,10 +287,12 @@ class Registrar:
         """Normal equations of `registration.Pair`s at a level, one `registration.PairSums` each."""
         count = len(pairs)
         sums = self._array("sums", registration.PairSums, count)
-        before = [self._levels, level, grey, depth, self._floors, self._points, self._images, self._motions]
-        before.append(self._upload("pairs", registration.Pair, pairs))
-        self._by_groups(registration.sum_pairs, count, before, sums)
+        self._sum_pairs(level, count, self._upload("pairs", registration.Pair, pairs), grey, depth, sums)
         return np.array(sums.numpy()[:count])
+
+    def _sum_pairs(self, level: int, count: int, pairs: wp.array, grey: float, depth: float, sums: wp.array) -> None:
+        before = [self._levels, level, grey, depth, self._floors, self._points, self._images, self._motions, pairs]
+        self._by_groups(registration.sum_pairs, count, before, sums)
 
     def rotations(self, smallest: np.ndarray, row: int, candidates: np.ndarray) -> np.ndarray:
         """1 - correlation of the smallest images under each rotation (n, 3, 3), of each of ``smallest`` (k, pixels)
@@ -271,6 +349,34 @@ class Registrar:
         for name in ("position", "normal", "grey"):
             wp.copy(getattr(new, name), getattr(old, name), count=getattr(old, name).size)
         self._points = new
+
+
+class _Report:
+    """Arrays of `Registrar.follow` that lie in one buffer, so that one read brings them all."""
+
+    def __init__(self, pixels: int, device: wp.Device) -> None:
+        parts = {
+            "started": (registration.Result, 1),
+            "joined": (registration.Result, 1),
+            "back": (registration.PairSums, 1),
+            "shares": (wp.float32, MOST_NEAR),
+            "depth": (wp.float32, pixels),
+        }
+        sizes = [count * wp.types.type_size_in_bytes(dtype) for dtype, count in parts.values()]
+        starts = np.cumsum([0, *(-(-size // ALIGNED) * ALIGNED for size in sizes)]).tolist()
+        self._buffer = wp.zeros(starts[-1], dtype=wp.uint8, device=device)
+        self._parts = {}
+        for (name, (dtype, count)), at, size in zip(parts.items(), starts[:-1], sizes, strict=True):
+            array = wp.array(ptr=self._buffer.ptr + at, dtype=dtype, shape=count, capacity=size, device=device)
+            self._parts[name] = slice(at, at + size), array
+        self.started, self.joined, self.back, self.shares, self.depth = (array for _, array in self._parts.values())
+
+    def read(self) -> dict[str, np.ndarray]:
+        """All of them, by name."""
+        found = self._buffer.numpy().copy()
+        types = {name: array.dtype for name, (_, array) in self._parts.items()}
+        dtypes = {name: np.float32 if dtype is wp.float32 else dtype.numpy_dtype() for name, dtype in types.items()}
+        return {name: found[part].view(dtypes[name]) for name, (part, _) in self._parts.items()}
 
 
 def new_tasks(count: int) -> Any:

@@ -28,7 +28,7 @@ from warpslam.scene.keyframes import Keyframe
 from warpslam.tracking.direct.aliases import difference_elsewhere
 from warpslam.tracking.direct.measures import Measures
 from warpslam.tracking.direct.pyramid import PyramidPlan, records
-from warpslam.tracking.direct.registrar import Floors, Registrar, new_tasks
+from warpslam.tracking.direct.registrar import MOST_NEAR, Floors, Registrar, new_tasks
 from warpslam.tracking.direct.second import Picture, SecondWitness
 from warpslam.tracking.direct.window import Pose, refine_window
 from warpslam.tracking.features.witness import Witness
@@ -40,7 +40,7 @@ CACHED = 24
 """Rows of images of keyframes; those of others are built anew when they are wanted."""
 MIN_OVERLAP = 0.35
 """Of a keyframe in the joint registration."""
-NEAR_KEYFRAMES = 24
+NEAR_KEYFRAMES = MOST_NEAR
 """Keyframes, the nearest by pose, whose overlap is looked at."""
 DEGREE = 0.02
 """Metres that a degree counts for when keyframes are ordered by nearness."""
@@ -237,7 +237,7 @@ class DirectTracker:
         self._typical_cost = np.inf
         self._before: _Before | None = None
         self._found: _Found | None = None
-        self._is_foretold = False
+        self._foretold: np.ndarray | None = None  # by constant speed, for this frame
         self._rivals: list[Attempt] = []
         self._rotations = rotation_grid(config.search_span)
         self._second = SecondWitness(camera, device, max_depth, keyframes, images)
@@ -269,7 +269,7 @@ class DirectTracker:
             self._before = None  # the pose was forgotten: nothing tells where that frame is from here
         found = self._found
         starts = history.starts(constant_speed=True, bridge=BRIDGE) if found is None else found.starts
-        self._is_foretold, self._rivals = len(starts) > 1, []
+        self._foretold, self._rivals = starts[0] if len(starts) > 1 else None, []
         best: Attempt | None = None
         done: Followed | None = None
         if history.was_known or found is not None:
@@ -336,7 +336,7 @@ class DirectTracker:
 
     def _located(self, pose: np.ndarray, done: Followed, history: FrameHistory) -> Located:
         measures = done.attempt.measures
-        is_bridged = self._is_foretold and self._found is None and done.attempt.moved < NEAR_SHIFT
+        is_bridged = self._foretold is not None and self._found is None and done.attempt.moved < NEAR_SHIFT
         return Located(
             pose,
             after_loss=not history.was_known and not is_bridged,
@@ -355,7 +355,7 @@ class DirectTracker:
         """
         last = history.last_known
         gap = MAX_GAP + 1 if last is None else len(history) - last
-        is_near = self._is_foretold and attempt.moved < NEAR_SHIFT
+        is_near = self._foretold is not None and attempt.moved < NEAR_SHIFT
         if not is_near and self._has_rival(row, pose, attempt):
             self._found = None
             return "two places look alike from here"
@@ -392,6 +392,8 @@ class DirectTracker:
             is_alike = other.measures.agreement > FOUND_AGREEMENT and other.cost < UNIQUE * attempt.cost
             if is_alike and _is_elsewhere(pose, self._pose_of(other)):
                 return True
+        if self._foretold is not None and motion_between(self._foretold, pose)[0] < SAME_STEP:
+            return False  # it goes on as it did: no period further
         weights = self.config.grey_weight, self.config.depth_weight
         return difference_elsewhere(self.registrar, row, SCRATCH, weights, SAME_STEP) < TELLING
 
@@ -427,57 +429,56 @@ class DirectTracker:
         task["T"] = inverse(start) @ W
         if best is not None:
             task["top"], task["exposure"], task["T"] = 0, best.exposure, best.T_frame_keyframe
-        started = self.registrar.start(task)
         wanted = [k for k, share in sorted(self._overlap.items(), key=lambda item: -item[1]) if share > MIN_OVERLAP]
         joined = [reference, *[k for k in wanted if k != reference]][: max(self.config.joint, 1)]
-        to_reference = inverse(W) @ np.array([self.keyframes[k].pose for k in joined])
         joint = records(registration.Joint)
         joint["row"], joint["count"], joint["level"] = row, len(joined), 0
         joint["keyframes"][0, : len(joined)] = [self._points_of(k) for k in joined]
         joint["iterations"] = self.config.joint_iterations if self.config.joint > 0 else 0
         joint["grey"], joint["depth"] = self.config.grey_weight, self.config.depth_weight
         self._ask_motion(joint, frame, history, W)
-        final = self.registrar.join(started, joint, to_reference)
         near = self._nearest(start)
-        shares = self.registrar.overlaps(
-            row,
-            final,
+        found = self.registrar.follow(
+            task,
+            joint,
+            self._to_reference(reference, joined),
             [self._points_of(k) for k in near],
-            inverse(W) @ np.array([self.keyframes[k].pose for k in near]),
+            self._to_reference(reference, near),
+            self._pair_back(reference),
         )
-        result, last = started.numpy()[0].copy(), final.numpy()[0].copy()
-        self._overlap = dict(zip(near, shares.numpy()[: len(near)].tolist(), strict=True))
+        self._overlap = dict(zip(near, found.shares.tolist(), strict=True))
+        result = found.result
         attempt = replace(self._attempt(reference, result), moved=self._shift(row, task[0]["T"], result["T"]))
         if best is not None:
             attempt = replace(
                 attempt, cost=best.cost, measures=best.measures, grey_scale=best.grey_scale, moved=best.moved
             )
-        T, T_joint = (np.asarray(one["T"], np.float64) for one in (result, last))
+        T, T_joint, back = (
+            np.asarray(result["T"], np.float64),
+            np.asarray(found.joined["T"], np.float64),
+            found.back,
+        )
         if _is_elsewhere(T_joint, T):
-            T_joint = T
-        attempt = replace(attempt, back=self._measure_back(row, reference, T_joint))
-        seen = Measures.of(result["record_0"])
+            pair = self._pair_back(reference)
+            T_joint, pair["T"] = T, inverse(T)
+            back = self.registrar.pairs(self.plan.middle, pair, self.config.grey_weight, self.config.depth_weight)[0]
         return Followed(
-            attempt,
+            replace(attempt, back=Measures.of(back["counts"])),
             T_joint,
-            seen,
+            Measures.of(result["record_0"]),
             self._depth_error(row, attempt),
-            covariance_of(np.asarray(last["H"], np.float64)),
+            covariance_of(np.asarray(found.joined["H"], np.float64)),
         )
 
-    def _measure_back(self, row: int, keyframe: int, T_frame_keyframe: np.ndarray) -> Measures:
-        """How well a keyframe fits the points of a frame."""
-        level = self.plan.middle
-        self.registrar.select(row, SCRATCH, level)
+    def _to_reference(self, reference: int, keyframes: Sequence[int]) -> np.ndarray:
+        """From the axes of keyframes to those of the reference, (n, 4, 4)."""
+        return inverse(self.keyframes[reference].pose) @ np.array([self.keyframes[k].pose for k in keyframes])
+
+    def _pair_back(self, keyframe: int) -> Any:
+        """A keyframe in the points of a frame; the pose is left to fill in."""
         pair = records(registration.Pair)
-        pair["keyframe"], pair["row"], pair["T"] = (
-            SCRATCH,
-            self._row(self.keyframes[keyframe]),
-            inverse(T_frame_keyframe),
-        )
-        pair["exposure"] = (1.0, 0.0)
-        found = self.registrar.pairs(level, pair, self.config.grey_weight, self.config.depth_weight)[0]
-        return Measures.of(found["counts"])
+        pair["keyframe"], pair["row"], pair["exposure"] = SCRATCH, self._row(self.keyframes[keyframe]), (1.0, 0.0)
+        return pair
 
     def _shift(self, row: int, a: np.ndarray, b: np.ndarray) -> float:
         """How far two transforms put points apart, about [px of the middle level]."""
@@ -527,7 +528,7 @@ class DirectTracker:
     def _is_good(self, attempt: Attempt) -> bool:
         """Whether the pose can be believed."""
         m, config = attempt.measures, self.config
-        is_near = self._is_foretold and attempt.moved < NEAR_SHIFT and m.agreement > config.sure_agreement
+        is_near = self._foretold is not None and attempt.moved < NEAR_SHIFT and m.agreement > config.sure_agreement
         return (
             attempt.ok
             and m.agreement > config.lost_agreement
@@ -551,9 +552,9 @@ class DirectTracker:
         if history.last_known is not None or self._found is not None:
             # The frame before is at no place that is not confirmed yet.
             poses = [*starts, *(self._turned(row, starts) if self._found is None else [])]
-            foretold = starts[0] if self._is_foretold else None
+            foretold = self._foretold
             found = self._search(row, self._reference, poses, foretold)
-            is_near = self._is_foretold and best is not None and best.moved < NEAR_SHIFT
+            is_near = foretold is not None and best is not None and best.moved < NEAR_SHIFT
             if best is None or not self._is_good(best) or not is_near:
                 best = _better(best, found, by_cost=True)
             elif found is not None and self._is_good(found) and found.cost < DECISIVE * best.cost:
