@@ -374,6 +374,7 @@ class Slam:
             located.depth_error,
             correlation=located.correlation,
             covariance=located.covariance,
+            reference=located.reference,
             timings=account.seconds,
             message=located.why_lost,
         )

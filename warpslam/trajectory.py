@@ -57,6 +57,8 @@ class Located:
     """As in `FrameResult`."""
     covariance: np.ndarray | None = None
     """As in `FrameResult`."""
+    reference: int | None = None
+    """As in `FrameResult`."""
 
     @property
     def status(self) -> FrameStatus:

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tools.benchmarks import tracking
-from tools.benchmarks.tracking import Drive, Figures, drive, false_ok, judge, open_named, table
+from tools.benchmarks.tracking import Drive, Figures, drive, false_ok, judge, open_named, table, within_two_sigma
 from warpslam.camera import ONE_MOMENT, Intrinsics
 from warpslam.errors import WarpSlamError
 from warpslam.frames import FrameResult, FrameStatus
@@ -107,11 +107,24 @@ def test_figures():
     online, final = truth.copy(), truth.copy()
     online[3, 2, 3] += 0.05
     final[:, :3, 3] += 7.0
-    driven = Drive(online, final, [OK] * 8 + [LOST], np.array([9.0] + [0.02] * 8), 1.5)
+    unknown = np.full((9, 2), np.nan)
+    driven = Drive(online, final, [OK] * 8 + [LOST], np.array([9.0] + [0.02] * 8), unknown, 1.5)
     figures = judge(driven, truth)
     assert 1.0 < figures.ate_online_cm < 5.0 / np.sqrt(9) + 0.1 and 3.0 < figures.ate_online_max_cm <= 5.0
     assert figures.ate_final_cm < 1e-6 and figures.lost == 1 and figures.false_ok == [] and figures.frames == 9
+    assert np.isnan(figures.within_two_sigma)
     assert figures.cpu_ms_median == pytest.approx(20.0) and figures.cpu_ms_99 == pytest.approx(20.0)
+
+
+def test_share_within_two_sigma():
+    """Of frames that are OK and no keyframe, the shift since the keyframe against its deviation."""
+    truth = path(6)
+    final = truth.copy()
+    final[3:5, 2, 3] += 0.03
+    against = np.array([0, 0, 2, 2, 2, 2.0])
+    sigma = np.array([0.01, 0.01, 0.01, 0.01, 0.02, 0.01])
+    driven = Drive(truth, final, [OK] * 5 + [LOST], np.ones(6), np.column_stack([against, sigma]), 1.0)
+    assert within_two_sigma(driven, truth) == pytest.approx(2 / 3)  # frames 1, 3 and 4; 3 is off
 
 
 def test_drive_gives_the_first_pose_only():
@@ -174,12 +187,12 @@ def test_command(tmp_path, monkeypatch, capsys):
     )
     assert code == 1 and asked[0].tracking.optimizer == "adam" and not asked[0].mapping.enabled
     out = capsys.readouterr().out.splitlines()
-    assert out[2].startswith("| cabinet | 5 | 0.00 (0.00) | 0.00 (0.00) | 1 | 0 | ") and "no such folder" in out[3]
+    assert out[2].startswith("| cabinet | 5 | 0.00 (0.00) | 0.00 (0.00) | 1 | 0 | - | ") and "no such folder" in out[3]
     figures = json.loads(file.read_text())
     assert figures["cabinet"]["lost"] == 1 and figures["cabinet"]["false_ok"] == [] and "error" in figures["nowhere"]
 
 
 def test_table():
     """The rows as they are printed."""
-    text = table({"a": Figures(3, 1.234, 2, 0.5, 0.75, 1, [2], 44.4, 149.6, 12.34)})
-    assert text.splitlines()[2] == "| a | 3 | 1.23 (2.00) | 0.50 (0.75) | 1 | 1 | 44 / 150 | 12.3 |"
+    text = table({"a": Figures(3, 1.234, 2, 0.5, 0.75, 1, [2], 0.954, 44.4, 149.6, 12.34)})
+    assert text.splitlines()[2] == "| a | 3 | 1.23 (2.00) | 0.50 (0.75) | 1 | 1 | 95% | 44 / 150 | 12.3 |"

@@ -10,6 +10,7 @@ wrong in it after each "+" (see `warpslam render-room sequence --help`), then it
   returned, "final" with those after `Slam.finish`. A frame that is not OK counts with the pose it was given.
 - lost: frames that are not OK.
 - false OK: frames that are OK, but whose motion since the OK frame before them is off by more than 10 cm or 5 degrees.
+- within 2 sigma: share of frames whose shift against their keyframe is off by less than twice `FrameResult.sigma`.
 - CPU ms a frame: process time of `Slam.step`, all threads together, without the first frame; of mapping, too, where
   that is on. Wall: all steps and `Slam.finish`, without loading images.
 """
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -54,6 +56,10 @@ class Drive:
     """Of each frame."""
     cpu_seconds: np.ndarray
     """Process time of each step, shape (N,)."""
+    uncertainty: np.ndarray
+    """Shape (N, 2): the frame that each pose is against, and the standard deviation of the shift since [m]; NaN where
+    these are not known.
+    """
     wall_seconds: float
     """All steps and the end."""
 
@@ -70,6 +76,8 @@ class Figures:
     lost: int
     false_ok: list[int]
     """Numbers of the frames."""
+    within_two_sigma: float
+    """NaN where no pose has a covariance."""
     cpu_ms_median: float
     cpu_ms_99: float
     wall_seconds: float
@@ -77,7 +85,7 @@ class Figures:
 
 def drive(slam: Method, sequence: RgbdSequence) -> Drive:
     """Run all frames; the first one starts at its true pose where that is known."""
-    online, status, cpu, wall = [], [], [], 0.0
+    online, status, cpu, uncertainty, wall = [], [], [], [], 0.0
     for index in range(len(sequence)):
         frame = sequence[index]
         pose = frame.T_world_camera if index == 0 else None
@@ -87,10 +95,11 @@ def drive(slam: Method, sequence: RgbdSequence) -> Drive:
         wall += time.perf_counter() - start
         online.append(result.T_world_camera)
         status.append(str(result.status))
+        uncertainty.append((math.nan if result.reference is None else result.reference, result.sigma[0]))
     start = time.perf_counter()
     slam.finish()
     wall += time.perf_counter() - start
-    return Drive(np.array(online), np.array(slam.trajectory.poses), status, np.array(cpu), wall)
+    return Drive(np.array(online), np.array(slam.trajectory.poses), status, np.array(cpu), np.array(uncertainty), wall)
 
 
 def judge(driven: Drive, truth: np.ndarray) -> Figures:
@@ -109,6 +118,7 @@ def judge(driven: Drive, truth: np.ndarray) -> Figures:
         100 * final.max,
         sum(status != FrameStatus.OK for status in driven.status),
         false_ok(driven.online, driven.status, truth),
+        within_two_sigma(driven, truth),
         float(np.median(milliseconds)),
         float(np.quantile(milliseconds, 0.99)),
         driven.wall_seconds,
@@ -131,6 +141,20 @@ def false_ok(poses: np.ndarray, status: Sequence[str], truth: np.ndarray) -> lis
     off = np.linalg.norm(error[:, :3, 3], axis=1) > FALSE_STEP
     off |= np.degrees(rotation_angles(error[:, :3, :3])) > FALSE_TURN
     return now[off].tolist()
+
+
+def within_two_sigma(driven: Drive, truth: np.ndarray) -> float:
+    """Share of frames whose shift against their keyframe is off by less than two standard deviations, NaN if none has
+    any; ``truth`` as for `false_ok`. Frames hang on their keyframe: poses after the end have the shift as it was found.
+    """
+    against, sigma = driven.uncertainty.T
+    usable = np.isfinite(sigma) & np.isfinite(truth).all(axis=(1, 2)) & (against < np.arange(len(truth)))
+    usable &= np.array([one == FrameStatus.OK for one in driven.status])
+    now = np.flatnonzero(usable)
+    before = against[now].astype(int)
+    moved, expected = (np.linalg.inv(T[before]) @ T[now] for T in (driven.final, truth))
+    off = np.linalg.norm((np.linalg.inv(expected) @ moved)[:, :3, 3], axis=1)
+    return float(np.mean(off < 2.0 * sigma[now])) if len(now) else math.nan
 
 
 def open_named(text: str, cache: Path, frames: slice = slice(None), *, published: bool = False) -> RgbdSequence:
@@ -172,20 +196,24 @@ def open_named(text: str, cache: Path, frames: slice = slice(None), *, published
 def table(rows: dict[str, Figures | str]) -> str:
     """The figures of each sequence, or why there are none, as a Markdown table."""
     lines = [
-        "| sequence | frames | ATE online (max) [cm] | ATE final (max) [cm] | lost | false OK | CPU ms, median / 99 % "
-        "| wall [s] |",
-        "|---|---|---|---|---|---|---|---|",
+        "| sequence | frames | ATE online (max) [cm] | ATE final (max) [cm] | lost | false OK | within 2 sigma "
+        "| CPU ms, median / 99 % | wall [s] |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for name, row in rows.items():
         if isinstance(row, str):
-            lines.append(f"| {name} | {row} | | | | | | |")
+            lines.append(f"| {name} | {row} | | | | | | | |")
             continue
         lines.append(
             f"| {name} | {row.frames} | {row.ate_online_cm:.2f} ({row.ate_online_max_cm:.2f}) "
             f"| {row.ate_final_cm:.2f} ({row.ate_final_max_cm:.2f}) | {row.lost} | {len(row.false_ok)} "
-            f"| {row.cpu_ms_median:.0f} / {row.cpu_ms_99:.0f} | {row.wall_seconds:.1f} |"
+            f"| {_percent(row.within_two_sigma)} | {row.cpu_ms_median:.0f} / {row.cpu_ms_99:.0f} | {row.wall_seconds:.1f} |"
         )
     return "\n".join(lines)
+
+
+def _percent(share: float) -> str:
+    return "-" if math.isnan(share) else f"{share:.0%}"
 
 
 def measure(text: str, options: argparse.Namespace) -> Figures:
