@@ -112,7 +112,7 @@ def test_figures():
     figures = judge(driven, truth)
     assert 1.0 < figures.ate_online_cm < 5.0 / np.sqrt(9) + 0.1 and 3.0 < figures.ate_online_max_cm <= 5.0
     assert figures.ate_final_cm < 1e-6 and figures.lost == 1 and figures.false_ok == [] and figures.frames == 9
-    assert np.isnan(figures.within_two_sigma)
+    assert figures.within_two_sigma is None
     assert figures.cpu_ms_median == pytest.approx(20.0) and figures.cpu_ms_99 == pytest.approx(20.0)
 
 

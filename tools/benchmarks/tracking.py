@@ -76,8 +76,8 @@ class Figures:
     lost: int
     false_ok: list[int]
     """Numbers of the frames."""
-    within_two_sigma: float
-    """NaN where no pose has a covariance."""
+    within_two_sigma: float | None
+    """None where no pose has a covariance."""
     cpu_ms_median: float
     cpu_ms_99: float
     wall_seconds: float
@@ -143,8 +143,8 @@ def false_ok(poses: np.ndarray, status: Sequence[str], truth: np.ndarray) -> lis
     return now[off].tolist()
 
 
-def within_two_sigma(driven: Drive, truth: np.ndarray) -> float:
-    """Share of frames whose shift against their keyframe is off by less than two standard deviations, NaN if none has
+def within_two_sigma(driven: Drive, truth: np.ndarray) -> float | None:
+    """Share of frames whose shift against their keyframe is off by less than two standard deviations, None if none has
     any; ``truth`` as for `false_ok`. Frames hang on their keyframe: poses after the end have the shift as it was found.
     """
     against, sigma = driven.uncertainty.T
@@ -154,7 +154,7 @@ def within_two_sigma(driven: Drive, truth: np.ndarray) -> float:
     before = against[now].astype(int)
     moved, expected = (np.linalg.inv(T[before]) @ T[now] for T in (driven.final, truth))
     off = np.linalg.norm((np.linalg.inv(expected) @ moved)[:, :3, 3], axis=1)
-    return float(np.mean(off < 2.0 * sigma[now])) if len(now) else math.nan
+    return float(np.mean(off < 2.0 * sigma[now])) if len(now) else None
 
 
 def open_named(text: str, cache: Path, frames: slice = slice(None), *, published: bool = False) -> RgbdSequence:
@@ -207,13 +207,14 @@ def table(rows: dict[str, Figures | str]) -> str:
         lines.append(
             f"| {name} | {row.frames} | {row.ate_online_cm:.2f} ({row.ate_online_max_cm:.2f}) "
             f"| {row.ate_final_cm:.2f} ({row.ate_final_max_cm:.2f}) | {row.lost} | {len(row.false_ok)} "
-            f"| {_percent(row.within_two_sigma)} | {row.cpu_ms_median:.0f} / {row.cpu_ms_99:.0f} | {row.wall_seconds:.1f} |"
+            f"| {_percent(row.within_two_sigma)} | {row.cpu_ms_median:.0f} / {row.cpu_ms_99:.0f} "
+            f"| {row.wall_seconds:.1f} |"
         )
     return "\n".join(lines)
 
 
-def _percent(share: float) -> str:
-    return "-" if math.isnan(share) else f"{share:.0%}"
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{share:.0%}"
 
 
 def measure(text: str, options: argparse.Namespace) -> Figures:
