@@ -54,6 +54,10 @@ MAX_MOTION = 0.3, 30.0
 """A frame [m], [degrees]; more is believed where the last steps were nearly as long."""
 FOUND_AGREEMENT, FOUND_CORRELATION, FOUND_KNOWN = 0.75, 0.9, 0.25
 """What a place found again must reach."""
+BACK_CORRELATION, FOUND_BACK_CORRELATION = 0.5, 0.8
+"""Of grey values, looked at from the frame, for any pose and for that of a place found again: less than the other way,
+since it is on small images, where thin lines are lost (0.55 at least on right poses of seven sequences).
+"""
 CONFIRMATIONS = 3
 """Frames that must follow before a place found again is believed."""
 UNIQUE = 1.5
@@ -363,7 +367,9 @@ class DirectTracker:
         if gap <= MAX_GAP and not history.is_jump(pose, *MAX_MOTION):
             return ""
         m, back = attempt.measures, attempt.back
-        alike = back is None or min(m.agreement, back.agreement) > FOUND_AGREEMENT
+        alike = back is None or (
+            min(m.agreement, back.agreement) > FOUND_AGREEMENT and back.correlation > FOUND_BACK_CORRELATION
+        )
         usual = attempt.grey_scale < 2.0 * max(self._typical_scale, 4.0)
         if not (alike and usual and m.correlation > FOUND_CORRELATION and m.known > FOUND_KNOWN):
             self._found = None
@@ -380,9 +386,10 @@ class DirectTracker:
     def _why_doubted(self, done: Followed) -> str:
         """What speaks against a pose that fits; empty if nothing does."""
         back, sigma = done.attempt.back, float(np.linalg.eigvalsh(done.covariance[:3, :3])[-1]) ** 0.5
-        # Not by grey values: thin lines are lost at this level.
         if back is not None and back.agreement < self.config.lost_agreement:
             return f"looked at from the frame, only {back.agreement:.0%} of the keyframe's depth agrees"
+        if back is not None and back.correlation < BACK_CORRELATION:
+            return f"looked at from the frame, grey values of the keyframe correlate by only {back.correlation:.2f}"
         if not sigma < MAX_SIGMA:
             return f"a direction is left open: the position is uncertain by {sigma:.2f} m"
         return ""
