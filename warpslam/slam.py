@@ -285,7 +285,7 @@ class Slam:
 
     def _track(self, frame: AdmittedFrame) -> Located:
         if self.direct is not None:
-            return self.direct.locate(frame, self.history)
+            return self.direct.locate(frame, self.history, None if self.scene.is_empty else self.scene.arrays())
         self.images.rectify_current(self._motion(frame))
         return self.localizer.locate(self.scene.arrays(), self.images, frame.index, self.history, self.keyframes)
 

@@ -192,6 +192,9 @@ class DirectConfig(_Group):
     depth_floor: float = Field(0.02, gt=0, description="geometric residuals spread by no less [sigma of depth]")
     joint: int = Field(3, ge=0, le=4, description="keyframes that a pose is registered to at once; 0 = the nearest")
     joint_iterations: int = Field(3, ge=1, le=20, description="iterations of that")
+    map_weight: float = Field(
+        0.0, ge=0, description="weight of a frame's points against the surface of the map, beside that of depth"
+    )
     window: int = Field(7, ge=0, le=20, description="keyframes refined when one is added; 0 = none")
     window_iterations: int = Field(2, ge=1, le=20, description="iterations of that")
     keyframe_overlap: float = Field(

@@ -21,14 +21,19 @@ def query(batch: RayBatch, arrays: FieldArrays, stage: str) -> None:
     """Logit (and colour, in the colour stage) of every sample: `RayBatch.logit`, `RayBatch.color`."""
 
     def steps(first: int, stop: int, slot: int) -> list[Step]:
-        result = [_start(batch, first, stop, slot)]
-        result += _logits(batch, arrays, stage, first, stop, 0, batch.sample_count, EXACT)
+        result = query_logits(batch, arrays, stage, first, stop, slot)
         if stage == "color":
             result.append(_weighty_samples(batch, first, stop, slot, 0.0))
             result.append(_color_forward(batch, arrays, first, stop, slot))
         return result
 
     batch.launcher.slices(batch.count, steps, whole=batch.kernels.by_sample)
+
+
+def query_logits(batch: RayBatch, arrays: FieldArrays, stage: str, first: int, stop: int, slot: int) -> list[Step]:
+    """Logit of every sample of some rays that are kept."""
+    samples = batch.sample_count
+    return [_start(batch, first, stop, slot), *_logits(batch, arrays, stage, first, stop, 0, samples, EXACT)]
 
 
 def render(

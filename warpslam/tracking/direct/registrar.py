@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warpslam.kernels.direct import equations, images, points, registration
+from warpslam.kernels.direct import equations, images, map_rows, points, registration
 from warpslam.runtime.launching import Launcher, Step
 from warpslam.tracking.direct.pyramid import PyramidPlan, records
 
@@ -70,13 +70,14 @@ class Registrar:
         self._launcher = Launcher(device)
         self._levels = plan.to_device(device)
         self._iterations = wp.array(plan.iterations, dtype=int, device=device)
-        self._floors = floors.to_struct()
+        self.floors, self._floors = floors, floors.to_struct()
         shape = (rows, plan.pixels)
         self._images = images.Images()
         self._images.grey = wp.zeros(shape, dtype=float, device=device)
         self._images.shades = wp.zeros(shape, dtype=wp.vec3, device=device)
         self._images.depth = wp.zeros(shape, dtype=float, device=device)
-        self._points = self._new_points(FIRST_KEYFRAMES)
+        self.points = self._new_points(FIRST_KEYFRAMES)
+        """Of keyframes, as kernels take them, until more rows are wanted."""
         still = records(points.Motion, rows)
         still["to_depth"] = np.eye(4)
         self._motions = wp.array(still, dtype=points.Motion, device=device)
@@ -117,7 +118,7 @@ class Registrar:
 
     def select(self, row: int, keyframe: int, first_level: int = 0) -> None:
         """Choose the points of an image, from level ``first_level`` up, and keep them as those of ``keyframe``."""
-        while keyframe >= self._points.grey.shape[0]:
+        while keyframe >= self.points.grey.shape[0]:
             self._grow()
         levels = self.plan.levels
         count = self.plan.points - int(levels[first_level]["first_point"])
@@ -128,7 +129,7 @@ class Registrar:
             row,
             self._motions,
             self.max_depth,
-            self._points,
+            self.points,
             keyframe,
         ]
         self._launcher.launch(points.select_points, count, inputs)
@@ -160,7 +161,7 @@ class Registrar:
         count = len(tasks)
         if results is None:
             results = self._array("results", registration.Result, count)
-        before = [self._levels, self._iterations, self._floors, self._points, self._images, self._motions]
+        before = [self._levels, self._iterations, self._floors, self.points, self._images, self._motions]
         before.append(self._upload("tasks", registration.Task, tasks))
         self._by_groups(registration.register, count, before, results)
         return results
@@ -170,7 +171,7 @@ class Registrar:
         start: wp.array,
         joint: np.ndarray,
         to_reference: np.ndarray,
-        others: np.ndarray | None = None,
+        others: wp.array | None = None,
         result: wp.array | None = None,
     ) -> wp.array:
         """A `registration.Joint` from the pose of ``start`` on, without waiting; its `registration.Result` (1,).
@@ -178,7 +179,7 @@ class Registrar:
         others: `registration.OtherRows` that join.
         """
         if others is None:
-            others = records(registration.OtherRows)
+            others = self._array("others", registration.OtherRows, 1)
         joints = self._upload("joints", registration.Joint, joint)
         matrices = self._upload("to_reference", wp.mat44, to_reference.astype(np.float32))
         if result is None:
@@ -186,12 +187,12 @@ class Registrar:
         inputs = [
             self._levels,
             self._floors,
-            self._points,
+            self.points,
             self._images,
             self._motions,
             joints,
             matrices,
-            self._upload("others", registration.OtherRows, others),
+            others,
             start,
             self.lanes,
             self._histograms(1),
@@ -209,6 +210,7 @@ class Registrar:
         near_to_reference: np.ndarray,
         back: np.ndarray,
         others: np.ndarray | None = None,
+        more: Callable[[wp.array, wp.array, int], None] | None = None,
     ) -> FollowedRecords:
         """Register to the reference, from there to several keyframes at once, see which others overlap, and look back;
         all of it is read at once.
@@ -222,16 +224,29 @@ class Registrar:
             back: A `registration.Pair`, from the frame's points, which are chosen here, to the reference; its pose is
                 filled in: the inverse of the joint one.
             others: `registration.OtherRows` that join.
+            more: Writes one more into the array that is its second argument, at the place that is its third, for the
+                pose of the `registration.Result` that is its first; the frame's points are chosen for it.
         """
         row = int(joint["row"][0])
         report = self._report
+        scratch = int(back["keyframe"][0])
         started = self.start(task, report.started)
-        joined = self.join(started, joint, joint_to_reference, others, report.joined)
+        if others is None:
+            others = records(registration.OtherRows, 0)
+        rows = self._array("others", registration.OtherRows, len(others) + 1)
+        if len(others):
+            rows[: len(others)].assign(others)
+        joint["others"] = len(others)
+        if more is not None:
+            self.select(row, scratch)
+            more(started, rows, len(others))
+            joint["others"] += 1
+        joined = self.join(started, joint, joint_to_reference, rows, report.joined)
         self.overlaps(row, joined, near, near_to_reference, report.shares)
         pairs = self._upload("back", registration.Pair, back)
         self._launcher.launch(registration.look_back, 1, [joined, pairs])
         level = self.plan.middle
-        self.select(row, int(back["keyframe"][0]), level)
+        self.select(row, scratch, level)
         self._sum_pairs(level, 1, pairs, float(task["grey"][0]), float(task["depth"][0]), report.back)
         first = int(self.plan.levels[-1]["first"])
         wp.copy(report.depth, self._images.depth[row], src_offset=first, count=report.depth.size)
@@ -262,7 +277,7 @@ class Registrar:
             self._levels,
             level,
             OVERLAP_STRIDE,
-            self._points,
+            self.points,
             self._images,
             row,
             self._motions,
@@ -283,6 +298,10 @@ class Registrar:
         still = self._upload("identity", registration.Result, identity)
         return np.array(self.overlaps(row, still, keyframes, T_frame_keyframe).numpy()[: len(keyframes)])
 
+    def sum_map_rows(self, inputs: list[Any], rows: wp.array, at: int) -> None:
+        """Launch `map_rows.sum_map_rows`, without waiting."""
+        self._launcher.launch(map_rows.sum_map_rows, self.lanes, [*inputs, self.lanes, self._histograms(1), rows, at])
+
     def pairs(self, level: int, pairs: np.ndarray, grey: float, depth: float) -> np.ndarray:
         """Normal equations of `registration.Pair`s at a level, one `registration.PairSums` each."""
         count = len(pairs)
@@ -291,7 +310,7 @@ class Registrar:
         return np.array(sums.numpy()[:count])
 
     def _sum_pairs(self, level: int, count: int, pairs: wp.array, grey: float, depth: float, sums: wp.array) -> None:
-        before = [self._levels, level, grey, depth, self._floors, self._points, self._images, self._motions, pairs]
+        before = [self._levels, level, grey, depth, self._floors, self.points, self._images, self._motions, pairs]
         self._by_groups(registration.sum_pairs, count, before, sums)
 
     def rotations(self, smallest: np.ndarray, row: int, candidates: np.ndarray) -> np.ndarray:
@@ -344,11 +363,11 @@ class Registrar:
         return new
 
     def _grow(self) -> None:
-        old = self._points
+        old = self.points
         new = self._new_points(2 * old.grey.shape[0])
         for name in ("position", "normal", "grey"):
             wp.copy(getattr(new, name), getattr(old, name), count=getattr(old, name).size)
-        self._points = new
+        self.points = new
 
 
 class _Report:

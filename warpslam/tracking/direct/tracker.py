@@ -10,7 +10,7 @@ refined together (`warpslam.tracking.direct.window`); frames hang on their keyfr
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +19,7 @@ import warp as wp
 
 from warpslam.camera import NO_MOTION, FrameMotion, Intrinsics
 from warpslam.config import DirectConfig
+from warpslam.field.arrays import FieldArrays
 from warpslam.frames import AdmittedFrame
 from warpslam.kernels.direct import equations as eq
 from warpslam.kernels.direct import points, registration
@@ -26,6 +27,7 @@ from warpslam.poses import inverse, motion_between, motion_of, orthonormalized, 
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
 from warpslam.tracking.direct.aliases import difference_elsewhere
+from warpslam.tracking.direct.map_rows import MapRows
 from warpslam.tracking.direct.measures import Measures
 from warpslam.tracking.direct.pyramid import PyramidPlan, records
 from warpslam.tracking.direct.registrar import MOST_NEAR, Floors, Registrar, new_tasks
@@ -242,6 +244,8 @@ class DirectTracker:
         self._before: _Before | None = None
         self._found: _Found | None = None
         self._foretold: np.ndarray | None = None  # by constant speed, for this frame
+        self._field: FieldArrays | None = None  # the map, for this frame
+        self._map_rows: MapRows | None = None
         self._rivals: list[Attempt] = []
         self._rotations = rotation_grid(config.search_span)
         self._second = SecondWitness(camera, device, max_depth, keyframes, images)
@@ -259,9 +263,12 @@ class DirectTracker:
         self._add_keyframe(frame.index, pose, self.images.keep_current())
         self._note(frame)
 
-    def locate(self, frame: AdmittedFrame, history: FrameHistory) -> Located:
-        """Pose of the frame, which comes after the frames of ``history``."""
+    def locate(self, frame: AdmittedFrame, history: FrameHistory, field: FieldArrays | None = None) -> Located:
+        """Pose of the frame, which comes after the frames of ``history``; ``field``: the map, where its surface is to
+        join in (`DirectConfig.map_weight`).
+        """
         self._build_missing()
+        self._field = field if self.config.map_weight > 0 else None
         row = self._load(frame)
         self._foretell_motion(frame, history)
         if not self.keyframes:
@@ -453,6 +460,7 @@ class DirectTracker:
             [self._points_of(k) for k in near],
             self._to_reference(reference, near),
             self._pair_back(reference),
+            more=None if self._field is None else self._rows_of_map(self._field, W),
         )
         self._overlap = dict(zip(near, found.shares.tolist(), strict=True))
         result = found.result
@@ -477,6 +485,17 @@ class DirectTracker:
             self._depth_error(row, attempt),
             covariance_of(np.asarray(found.joined["H"], np.float64)),
         )
+
+    def _rows_of_map(
+        self, field: FieldArrays, T_world_reference: np.ndarray
+    ) -> Callable[[wp.array, wp.array, int], None]:
+        """What writes the rows of the frame's points against the surface of the map."""
+        map_rows = self._map_rows = self._map_rows or MapRows(self.registrar, 0, self.config.map_weight)
+
+        def add(pose: wp.array, rows: wp.array, at: int) -> None:
+            map_rows.add(field, pose, T_world_reference, SCRATCH, rows, at)
+
+        return add
 
     def _to_reference(self, reference: int, keyframes: Sequence[int]) -> np.ndarray:
         """From the axes of keyframes to those of the reference, (n, 4, 4)."""
