@@ -13,6 +13,7 @@ import numpy as np
 from warpslam.errors import DatasetError
 from warpslam.evaluation import ate
 from warpslam.frames import FrameStatus
+from warpslam.pipeline.read_ahead import ReadAhead
 from warpslam.pipeline.results import trajectory_of
 from warpslam.runs.record import Progress
 
@@ -82,13 +83,17 @@ class FrameLoop:
         self._check_that_one_was_used()
 
     def _readable_frames(self) -> Iterator[Frame]:
+        with ReadAhead(self.sequence, self.selected[self.record.position :]) as reader:
+            yield from self._frames_of(reader)
+
+    def _frames_of(self, reader: ReadAhead) -> Iterator[Frame]:
         record = self.record
         last = record.results[-1].timestamp if record.results else -np.inf
-        for index in self.selected[record.position :]:
+        for index in reader.indices:
             record.position += 1
             try:
                 with record.clock("reading"):
-                    frame = self.sequence[index]
+                    frame = reader.take()
                 # Against the frame before, whatever became of it: a single wrong time costs one frame, not the rest.
                 before, last = last, frame.timestamp
                 if last <= before:

@@ -36,12 +36,14 @@ class RgbdSequence(ABC):
     intrinsics: Camera of the frames as returned, that is after undistortion, resizing and cropping.
     preset: Name of the settings that suit the sequence (see `warpslam.config.PRESETS`).
     timing: When the pixels of the frames, as returned, are taken.
+    can_read_ahead: Whether a thread may read a frame while the one before is worked on.
     """
 
     name: str
     intrinsics: Intrinsics
     preset: str = "default"
     timing: SensorTiming = ONE_MOMENT
+    can_read_ahead: bool = True
 
     @abstractmethod
     def __len__(self) -> int: ...

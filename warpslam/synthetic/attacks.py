@@ -58,6 +58,7 @@ class AlteredSequence(RgbdSequence):
         self.intrinsics = base.intrinsics
         self.preset = base.preset
         self.timing = base.timing
+        self.can_read_ahead = base.can_read_ahead
         self.mesh = getattr(base, "mesh", None)
         self.warp_modules = getattr(base, "warp_modules", ())
         self.images = np.arange(len(base)) if images is None else np.asarray(images)

@@ -34,6 +34,7 @@ class RenderedSequence(RgbdSequence):
     """
 
     warp_modules = ("warpslam.kernels.raycast",)
+    can_read_ahead = False  # kernels of two threads would wait for one another
 
     def __init__(
         self,
