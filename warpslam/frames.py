@@ -65,12 +65,12 @@ class FrameResult:
     covariance: np.ndarray | None = None
     """Of the pose, float64 (6, 6): T_world_camera is uncertain by exp(xi) on its right, xi = (v, w) [m, rad],
     against the keyframe."""
-    reference: int | None = None
-    """Frame of the keyframe that correlation and covariance are against; None with other tracking."""
     timings: dict[str, float] = field(default_factory=dict)
     """Seconds by phase: "tracking", "mapping" (overlapped: waiting for it and taking it over), "keyframe"."""
     message: str = ""
     """Why the frame is not OK."""
+    reference: int | None = None
+    """Frame of the keyframe that correlation and covariance are against; None with other tracking."""
 
     @property
     def sigma(self) -> tuple[float, float]:

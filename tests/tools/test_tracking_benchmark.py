@@ -107,8 +107,8 @@ def test_figures():
     online, final = truth.copy(), truth.copy()
     online[3, 2, 3] += 0.05
     final[:, :3, 3] += 7.0
-    unknown = np.full((9, 2), np.nan)
-    driven = Drive(online, final, [OK] * 8 + [LOST], np.array([9.0] + [0.02] * 8), unknown, 1.5)
+    unknown = [None] * 9, np.full((9, 4, 4), np.nan), np.full(9, np.nan)
+    driven = Drive(online, final, [OK] * 8 + [LOST], np.array([9.0] + [0.02] * 8), *unknown, 1.5)
     figures = judge(driven, truth)
     assert 1.0 < figures.ate_online_cm < 5.0 / np.sqrt(9) + 0.1 and 3.0 < figures.ate_online_max_cm <= 5.0
     assert figures.ate_final_cm < 1e-6 and figures.lost == 1 and figures.false_ok == [] and figures.frames == 9
@@ -119,11 +119,11 @@ def test_figures():
 def test_share_within_two_sigma():
     """Of frames that are OK and no keyframe, the shift since the keyframe against its deviation."""
     truth = path(6)
-    final = truth.copy()
-    final[3:5, 2, 3] += 0.03
-    against = np.array([0, 0, 2, 2, 2, 2.0])
+    against = [None, 0, 2, 2, 2, 2]
+    since = np.array([np.linalg.inv(truth[k or 0]) @ T for k, T in zip(against, truth, strict=True)])
+    since[3:5, 2, 3] += 0.03
     sigma = np.array([0.01, 0.01, 0.01, 0.01, 0.02, 0.01])
-    driven = Drive(truth, final, [OK] * 5 + [LOST], np.ones(6), np.column_stack([against, sigma]), 1.0)
+    driven = Drive(truth, truth, [OK] * 5 + [LOST], np.ones(6), against, since, sigma, 1.0)
     assert within_two_sigma(driven, truth) == pytest.approx(2 / 3)  # frames 1, 3 and 4; 3 is off
 
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 import time
 from collections.abc import Sequence
@@ -56,10 +55,12 @@ class Drive:
     """Of each frame."""
     cpu_seconds: np.ndarray
     """Process time of each step, shape (N,)."""
-    uncertainty: np.ndarray
-    """Shape (N, 2): the frame that each pose is against, and the standard deviation of the shift since [m]; NaN where
-    these are not known.
-    """
+    against: list[int | None]
+    """Frame of the keyframe that each pose is against."""
+    since: np.ndarray
+    """Each pose in the axes of that keyframe as it then was, shape (N, 4, 4); NaN where there is none."""
+    sigma: np.ndarray
+    """Standard deviation of the shift since that keyframe [m], shape (N,); NaN where there is none."""
     wall_seconds: float
     """All steps and the end."""
 
@@ -85,7 +86,7 @@ class Figures:
 
 def drive(slam: Method, sequence: RgbdSequence) -> Drive:
     """Run all frames; the first one starts at its true pose where that is known."""
-    online, status, cpu, uncertainty, wall = [], [], [], [], 0.0
+    online, status, cpu, against, since, sigma, wall = [], [], [], [], [], [], 0.0
     for index in range(len(sequence)):
         frame = sequence[index]
         pose = frame.T_world_camera if index == 0 else None
@@ -95,11 +96,16 @@ def drive(slam: Method, sequence: RgbdSequence) -> Drive:
         wall += time.perf_counter() - start
         online.append(result.T_world_camera)
         status.append(str(result.status))
-        uncertainty.append((math.nan if result.reference is None else result.reference, result.sigma[0]))
+        reference = result.reference
+        against.append(reference)
+        sigma.append(result.sigma[0])
+        known = np.full((4, 4), np.nan) if reference is None else slam.trajectory.poses[reference]
+        since.append(np.linalg.inv(known) @ result.T_world_camera)
     start = time.perf_counter()
     slam.finish()
     wall += time.perf_counter() - start
-    return Drive(np.array(online), np.array(slam.trajectory.poses), status, np.array(cpu), np.array(uncertainty), wall)
+    final = np.array(slam.trajectory.poses)
+    return Drive(np.array(online), final, status, np.array(cpu), against, np.array(since), np.array(sigma), wall)
 
 
 def judge(driven: Drive, truth: np.ndarray) -> Figures:
@@ -145,16 +151,17 @@ def false_ok(poses: np.ndarray, status: Sequence[str], truth: np.ndarray) -> lis
 
 def within_two_sigma(driven: Drive, truth: np.ndarray) -> float | None:
     """Share of frames whose shift against their keyframe is off by less than two standard deviations, None if none has
-    any; ``truth`` as for `false_ok`. Frames hang on their keyframe: poses after the end have the shift as it was found.
+    any; ``truth`` as for `false_ok`.
     """
-    against, sigma = driven.uncertainty.T
-    usable = np.isfinite(sigma) & np.isfinite(truth).all(axis=(1, 2)) & (against < np.arange(len(truth)))
-    usable &= np.array([one == FrameStatus.OK for one in driven.status])
-    now = np.flatnonzero(usable)
-    before = against[now].astype(int)
-    moved, expected = (np.linalg.inv(T[before]) @ T[now] for T in (driven.final, truth))
-    off = np.linalg.norm((np.linalg.inv(expected) @ moved)[:, :3, 3], axis=1)
-    return float(np.mean(off < 2.0 * sigma[now])) if len(now) else None
+    good = []
+    for now, before in enumerate(driven.against):
+        if before is None or before >= now or driven.status[now] != FrameStatus.OK or not np.isfinite(truth[now]).all():
+            continue
+        expected = np.linalg.inv(truth[before]) @ truth[now]
+        off = np.linalg.norm((np.linalg.inv(expected) @ driven.since[now])[:3, 3])
+        if np.isfinite(off):
+            good.append(off < 2.0 * driven.sigma[now])
+    return float(np.mean(good)) if good else None
 
 
 def open_named(text: str, cache: Path, frames: slice = slice(None), *, published: bool = False) -> RgbdSequence:
