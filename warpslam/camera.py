@@ -100,7 +100,6 @@ class SensorTiming:
         stamped = 0.0 if depth_timestamp is None else depth_timestamp - timestamp
         return stamped + self.depth_delay
 
-
     def since(self, before: SensorTiming) -> TimingChange:
         """What it adds to another timing."""
         return TimingChange(self.depth_delay - before.depth_delay, self.readout - before.readout)
@@ -147,9 +146,7 @@ class FrameMotion:
 
     def retimed(self, change: TimingChange) -> FrameMotion:
         """The same frame, taken by a camera of another timing."""
-        return replace(
-            self, depth_offset=self.depth_offset + change.depth_delay, readout=self.readout + change.readout
-        )
+        return replace(self, depth_offset=self.depth_offset + change.depth_delay, readout=self.readout + change.readout)
 
     def to_array(self) -> np.ndarray:
         """Twist, depth_offset and readout, float64 (8,)."""

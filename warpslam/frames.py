@@ -66,12 +66,12 @@ class FrameResult:
     """Of the pose, float64 (6, 6): T_world_camera is uncertain by exp(xi) on its right, xi = (v, w) [m, rad]."""
     timings: dict[str, float] = field(default_factory=dict)
     """Seconds by phase: "tracking", "mapping" (overlapped: waiting for it and taking it over), "keyframe"."""
+    message: str = ""
+    """Why the frame is not OK."""
     sensor_timing: dict[str, float] = field(default_factory=dict)
     """What this frame completed the estimate of, used from the next frame on: "depth_delay" and "readout" as in
     `SensorTiming`, and "depth_delay_sigma" and "readout_sigma", their standard deviations [s]. Else empty.
     """
-    message: str = ""
-    """Why the frame is not OK."""
 
     @property
     def sigma(self) -> tuple[float, float]:

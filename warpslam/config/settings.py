@@ -214,8 +214,8 @@ class DirectConfig(_Group):
     lost_known: float = Field(0.08, ge=0, le=1, description="share of it where both have depth, for the same")
     timing: Literal["auto", "given"] = Field(
         "auto",
-        description="auto: delay of depth and readout time are estimated while the camera moves, where depth has stamps "
-        "of its own and the camera tells neither; given: what is not told is none",
+        description="auto: delay of depth and readout time are estimated while the camera moves, where depth has "
+        "stamps of its own and the camera tells neither; given: what is not told is none",
     )
     search_span: float = Field(24.0, gt=0, le=60, description="rotations searched, up to this [degrees]")
     search_kept: int = Field(3, ge=1, le=20, description="rotations tried further")

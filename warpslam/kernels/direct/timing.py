@@ -1,8 +1,8 @@
 """How the residuals of a pair change with the delay of depth and with the readout time.
 
-A pair is a keyframe's points and a frame. T takes points from the axes of one to those of the other, u_k and u_c are the
-twists of the camera at the two. Depth that is taken ``delay`` later, and rows that are read over ``readout`` more, move
-the keyframe's points against the frame by
+A pair is a keyframe's points and a frame. T takes points from the axes of one to those of the other, u_k and u_c are
+the twists of the camera at the two. Depth that is taken ``delay`` later, and rows that are read over ``readout`` more,
+move the keyframe's points against the frame by
 
     geometric residual    delay (Ad_T u_k - u_c) + readout (s_k Ad_T u_k - s_c u_c)
     photometric residual                           readout (s_k Ad_T u_k - s_c u_c)
@@ -16,6 +16,7 @@ J = [pose (6), gain, bias, delay, readout, residual]; a pair's sums are those of
 import warp as wp
 
 from warpslam.kernels.direct.equations import (
+    _GROUP_SUM,
     DEPTH_COUNT,
     GREY_COUNT,
     SUM_BOTH,
@@ -27,7 +28,6 @@ from warpslam.kernels.direct.equations import (
     depth_at,
     depth_sigma,
     evaluate,
-    _GROUP_SUM,
     scaled,
     student,
 )

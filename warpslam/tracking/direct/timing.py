@@ -1,9 +1,9 @@
-"""The camera's timing, estimated while it is tracked: by how much depth is late beyond its stamps, and the readout time.
+"""The camera's timing, estimated while it is tracked: delay of depth beyond its stamps, and the readout time.
 
 Each frame is evaluated against the keyframe beside it that the camera passed most differently: there its motion moves
-late depth against colour, and late rows against early ones (`warpslam.kernels.direct.timing`). A frame adds 2 x 2 normal
-equations, from which pose and exposure are eliminated. Twists come from the frames before and after, for an error of the
-frame's own pose must not look like motion.
+late depth against colour, and late rows against early ones (`warpslam.kernels.direct.timing`). A frame adds 2 x 2
+normal equations, from which pose and exposure are eliminated. Twists come from the frames before and after, for an
+error of the frame's own pose must not look like motion.
 
 Residuals of one frame, and of frames one after another, err together: the deviation is taken from how much blocks of
 frames differ. The weights of a t-distribution make a step too short by its information, which is divided out.
@@ -36,6 +36,12 @@ MAX_SIGMA = 0.004
 """An estimate must be known as well as this [s]."""
 SIGNIFICANCE = 3.0
 """Standard deviations that a timing must differ from 0 by."""
+MAX_STAGES = 4
+"""Estimates."""
+SETTLED = 0.003
+"""When an estimate is corrected by less, there is no more to find out [s]."""
+LINEAR = 0.3
+"""A step may be wrong by this share of it: residuals are not linear, and robust weights hold back."""
 MAX_STEP = 0.04
 """By which an estimate changes the timing at once [s]: further away residuals are not linear."""
 INFORMATION = 0.75
@@ -140,12 +146,13 @@ class TimingEstimator:
             self.timing = moved(self.timing, step)
             self._blocks, self._since = {}, next_frame + 1
             self._stage += 1
-            self.is_done = self._stage > 1
-            return FoundTiming(self.timing, (float(sigma[0]), float(sigma[1])))
+            is_settled = self._stage > 1 and bool((np.abs(step) < SETTLED).all())
+            self.is_done = is_settled or self._stage >= MAX_STAGES
+            return FoundTiming(self.timing, _told(sigma, step))
         if len(scores) > MAX_BLOCKS:
             self.is_done = True
             if max(sigma) <= MAX_SIGMA:
-                return FoundTiming(self.timing, (float(sigma[0]), float(sigma[1])))
+                return FoundTiming(self.timing, _told(sigma, np.zeros(2)))
         return None
 
     def state(self) -> TimingState:
@@ -249,6 +256,12 @@ def solve(blocks: np.ndarray, least: tuple[float, float] = (-np.inf, -np.inf)) -
     inverted = np.linalg.inv(total)
     variance = (inverted @ spread @ inverted).diagonal() / INFORMATION**2
     return step / INFORMATION, np.sqrt(variance + BIAS**2)
+
+
+def _told(sigma: np.ndarray, step: np.ndarray) -> tuple[float, float]:
+    """Standard deviations of what a step leads to."""
+    delay, readout = np.sqrt(sigma**2 + (LINEAR * step) ** 2).tolist()
+    return delay, readout
 
 
 def moved(timing: SensorTiming, step: np.ndarray) -> SensorTiming:
