@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +80,7 @@ class FakeSlam:
     interrupt_at: int | None = None
     fail_at: int | None = None
     lost_at: int | None = None
+    timed_at: int | None = None
     mesh_fails = False
     compile_seconds = 0.25
     device = "cpu"
@@ -105,6 +106,9 @@ class FakeSlam:
         status = FrameStatus.LOST if index == self.lost_at else FrameStatus.OK
         timings = {"tracking": 0.25, "mapping": 0.5}
         result = FrameResult(index, timestamp, T, status, {"loss": 1.5}, 0.9, 0.02, 0.95, np.diag(COVARIANCE), timings)
+        if index == self.timed_at:
+            found = {"depth_delay": -0.0203, "depth_delay_sigma": 0.002, "readout": 0.0261, "readout_sigma": 0.003}
+            result = replace(result, sensor_timing=found)
         self.results.append(result)
         return self.results[-1]
 

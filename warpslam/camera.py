@@ -100,6 +100,25 @@ class SensorTiming:
         stamped = 0.0 if depth_timestamp is None else depth_timestamp - timestamp
         return stamped + self.depth_delay
 
+    def since(self, before: SensorTiming) -> TimingChange:
+        """What it adds to another timing."""
+        return TimingChange(self.depth_delay - before.depth_delay, self.readout - before.readout)
+
+
+@dataclass(frozen=True)
+class TimingChange:
+    """Difference of two timings."""
+
+    depth_delay: float
+    """[s]."""
+    readout: float
+    """[s]."""
+
+    @property
+    def is_none(self) -> bool:
+        """Whether there is none."""
+        return self.depth_delay == 0.0 and self.readout == 0.0
+
 
 ONE_MOMENT = SensorTiming()
 """All pixels of a frame are taken at once."""
@@ -124,6 +143,10 @@ class FrameMotion:
     def with_twist(self, twist: np.ndarray) -> FrameMotion:
         """The same frame, taken with another twist (6,) [m/s, rad/s]."""
         return replace(self, twist=tuple(float(value) for value in twist))
+
+    def retimed(self, change: TimingChange) -> FrameMotion:
+        """The same frame, taken by a camera of another timing."""
+        return replace(self, depth_offset=self.depth_offset + change.depth_delay, readout=self.readout + change.readout)
 
     def to_array(self) -> np.ndarray:
         """Twist, depth_offset and readout, float64 (8,)."""

@@ -71,6 +71,10 @@ class FrameResult:
     """Why the frame is not OK."""
     reference: int | None = None
     """Frame of the keyframe that correlation and covariance are against; None with other tracking."""
+    sensor_timing: dict[str, float] = field(default_factory=dict)
+    """What this frame completed the estimate of, used from the next frame on: "depth_delay" and "readout" as in
+    `SensorTiming`, and "depth_delay_sigma" and "readout_sigma", their standard deviations [s]. Else empty.
+    """
 
     @property
     def sigma(self) -> tuple[float, float]:

@@ -35,6 +35,7 @@ from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.mapped_views import ObservedView, SeenDepth
 from warpslam.scene.scene_map import SceneMap
 from warpslam.slam_state import SlamState, read_slam, write_slam
+from warpslam.tracking.direct.timing import TimingEstimator, twist_between
 from warpslam.tracking.direct.tracker import DirectTracker
 from warpslam.tracking.localizer import Localizer
 from warpslam.tracking.tracker import Tracker
@@ -63,7 +64,8 @@ class Slam:
         seed: Of the initial features and of every random choice. Same input, seed and number of CPU cores: same result
             on the CPU (with the strict schedule).
         decoders: Decoder weights; by default those of `Config.decoders`, and failing that the package's own.
-        timing: When the camera's pixels are taken; `Config.sensor_timing` off = all at once.
+        timing: When the camera's pixels are taken; `Config.sensor_timing` off = all at once. Where none is known it is
+            estimated from frames whose depth has stamps of its own (`DirectConfig.timing`), and is then that.
     """
 
     has_checkpoints: ClassVar[bool] = True
@@ -96,6 +98,7 @@ class Slam:
         self.localizer = Localizer(self.tracker, self.config.tracking, intrinsics)
         self.mapper = Mapper(self.scene, intrinsics, self.config.mapping, self.config.sampling, self.device, seed)
         self.direct = self._direct_tracker()
+        self.timing_estimator = self._timing_estimator()
         self.scheduler = new_scheduler(self.config.schedule, self.mapper, self.images)
         self._seen: list[SeenDepth] = []
         self._digest: int | None = None
@@ -149,6 +152,7 @@ class Slam:
         located = self._locate(frame, account)  # Sec. 3.3, Eq. 11-12
         self.history.add(frame.timestamp, located)
         self._digest = digest
+        found = self._estimate_timing(frame, account)
         self._note_motion(frame)  # what is mapped and kept are images of one moment
         if located.status is FrameStatus.OK and self.config.mapping.enabled:
             is_keyframe = self._is_keyframe(frame)  # Sec. 3.4
@@ -156,7 +160,7 @@ class Slam:
                 self._map(frame, account)  # Sec. 3.3, Eq. 8-10, with local bundle adjustment
             if is_keyframe:
                 self._insert_keyframe(frame, account)
-        return self._result(frame, located, account)
+        return replace(self._result(frame, located, account), sensor_timing=found)
 
     def finish(self) -> dict[str, float]:
         """After the last frame: map it if it was not, then refine the whole map (Sec. 3.1). Returns the seconds by
@@ -214,6 +218,12 @@ class Slam:
         return DirectTracker(
             self.intrinsics, self.config.direct, max_depth, self.device, self.keyframes, self.images, readout
         )
+
+    def _timing_estimator(self, first: int = 0) -> TimingEstimator | None:
+        """What estimates the camera's timing from frame ``first`` on, where nothing is known of it."""
+        config = self.config
+        is_wanted = config.sensor_timing and config.direct.timing == "auto" and self.timing == ONE_MOMENT
+        return TimingEstimator(first=first) if self.direct is not None and is_wanted else None
 
     # -- its steps -----------------------------------------------------------------------------------------------
 
@@ -299,6 +309,22 @@ class Slam:
         return FrameMotion(depth_offset=frame.depth_offset, readout=self._timing.readout).with_twist(
             self.history.twist()
         )
+
+    def _estimate_timing(self, frame: AdmittedFrame, account: _Account) -> dict[str, float]:
+        """What is found out of the camera's timing by this frame; it is used from the next one on."""
+        estimator, direct = self.timing_estimator, self.direct
+        if estimator is None or direct is None:
+            return {}
+        with account.timed("tracking"):
+            found = estimator.look(direct, self.history, frame.depth_offset)
+            if found is None:
+                return {}
+            change, self.timing = found.timing.since(self.timing), found.timing
+            if not change.is_none:
+                twists = {one.index: twist_between(self.history, one.index) for one in direct.keyframes}
+                known = {index: twist for index, twist in twists.items() if twist is not None}
+                direct.retime(change, known, estimator.first)
+        return found.to_dict()
 
     def _note_motion(self, frame: AdmittedFrame) -> None:
         """Rectify the current image by how the camera came to its pose; and tell a keyframe just before of what came
@@ -481,7 +507,7 @@ class Slam:
             ConfigError: ``config`` does not fit the map.
         """
         state = read_slam(Path(path), config)
-        state = state if timing is None else replace(state, timing=timing)
+        state = state if timing is None else replace(state, timing=timing, timing_state=None)
         slam = cls.from_state(state, device, localize_only=localize_only)
         if localize_only:
             slam.forget_pose()
@@ -506,6 +532,7 @@ class Slam:
             mapped=self._mapped,
             direct=None if self.direct is None else self.direct.state(),
             digest=self._digest,
+            timing_state=None if self.timing_estimator is None else self.timing_estimator.state(),
         )
 
     @classmethod
@@ -535,6 +562,9 @@ class Slam:
                 direct.fixed = len(slam.keyframes)
             if direct is not None and state.direct is not None:
                 direct.restore(state.direct, state.current)
+        slam.timing_estimator = slam._timing_estimator(len(slam.history))
+        if slam.direct is not None and state.timing_state is not None:
+            slam.timing_estimator = TimingEstimator.restored(state.timing_state, state.timing)
         return slam
 
 

@@ -23,6 +23,7 @@ from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
 from warpslam.scene.scene_map import SceneState
 from warpslam.storage.state_file import StateFields, StateFormat, read_state, write_state
+from warpslam.tracking.direct.timing import TimingState
 from warpslam.tracking.direct.tracker import DirectState
 from warpslam.trajectory import HistoryState
 
@@ -63,6 +64,8 @@ class SlamState:
     """What direct tracking goes on from."""
     digest: int | None = None
     """By which the images of the last frame are known again."""
+    timing_state: TimingState | None = None
+    """What the estimate of the camera's timing goes on from."""
 
 
 def write_slam(path: Path, state: SlamState) -> None:
@@ -114,6 +117,7 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
         "keyframes": [keyframe.index for keyframe, _ in state.keyframes],
         "seen": [seen.index for seen in state.seen],
         "direct": None if state.direct is None else _direct_header(state.direct),
+        "timing_estimate": None if state.timing_state is None else _timing_header(state.timing_state),
     }
     rgb, depth, scale = state.current_image
     images = [image for _, image in state.keyframes]
@@ -132,6 +136,8 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
     }
     if state.direct is not None:
         arrays |= {f"direct_{name}": array for name, array in state.direct.arrays().items()}
+    if state.timing_state is not None:
+        arrays["timing_blocks"] = state.timing_state.blocks
     for n, image in enumerate(images):
         arrays[f"image_{n}_rgb"] = np.frombuffer(image.rgb, np.uint8)
         arrays[f"image_{n}_depth"] = np.frombuffer(image.depth, np.uint8)
@@ -202,6 +208,7 @@ def state_from_arrays(
         mapped=fields.frame("mapped", count),
         direct=_direct(fields, count, len(frames)),
         digest=fields.header.get("digest"),
+        timing_state=_timing_state(fields, count),
     )
 
 
@@ -274,6 +281,31 @@ def _direct(fields: StateFields, frames: int, keyframes: int) -> DirectState | N
         depth_sigma=depth_sigma,
         typical=(scale, cost),
     )
+
+
+def _timing_header(state: TimingState) -> dict[str, Any]:
+    return {name: value for name, value in vars(state).items() if name != "blocks"}
+
+
+def _timing_state(fields: StateFields, frames: int) -> TimingState | None:
+    header = fields.header.get("timing_estimate")
+    if header is None:
+        return None
+    blocks = fields.array("timing_blocks", np.float64, (None, 6)).copy()
+    try:
+        state = TimingState(
+            blocks=blocks,
+            first=int(header["first"]),
+            since=int(header["since"]),
+            stamped=bool(header["stamped"]),
+            stage=int(header["stage"]),
+            is_done=bool(header["is_done"]),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise fields.damaged("timing_estimate", error) from None
+    if not (0 <= state.first <= state.since and np.isfinite(blocks).all()):
+        raise fields.damaged("timing_estimate", f"frames from {state.first}, those that count from {state.since}")
+    return state
 
 
 def _seen_size(camera: Intrinsics) -> tuple[int, int]:

@@ -12,6 +12,7 @@ import yaml
 from PIL import Image
 
 from tests.fakes import COVARIANCE, FakeSequence, FakeSlam, run_sequence, true_pose, wall
+from warpslam.camera import SensorTiming
 from warpslam.config import Config
 from warpslam.errors import ConfigError, DatasetError, InputError, MeshError
 from warpslam.evaluation import load_mesh, psnr, ssim
@@ -101,6 +102,21 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
     assert "frame 7: OK" in folder.log.read_text()
     for file in folder.path.glob("*.png"):
         assert np.asarray(Image.open(file).convert("L")).std() > 5, f"{file.name} is blank"
+
+
+def test_timing_that_was_found_is_told(fake_slam, tmp_path, monkeypatch):
+    """In metrics.json, as camera.yaml takes it, in the log and in the report; a run that found none says nothing."""
+    plain = run_sequence(FakeSequence(8), Config(), tmp_path / "plain").folder
+    assert "found_timing" not in metrics_of(plain.path) and "estimated:" not in plain.report.read_text()
+    monkeypatch.setattr(fake_slam, "timed_at", 3)
+    sequence = FakeSequence(8, unreadable=(1,))
+    sequence.stored_timing = lambda timing: SensorTiming(timing.depth_delay, 2 * timing.readout)
+    folder = run_sequence(sequence, Config(), tmp_path / "timed").folder
+    assert metrics_of(folder.path)["found_timing"] == {
+        "depth_delay": -0.0203, "depth_delay_sigma": 0.002, "readout": 0.0522, "readout_sigma": 0.003, "after_frame": 4,
+    }  # fmt: skip
+    told = "depth_delay -0.0203 +- 0.0020 s, readout 0.0522 +- 0.0030 s, used after frame 4"
+    assert told in folder.log.read_text() and told in folder.report.read_text()
 
 
 def test_same_input_same_trajectory_bytes(fake_slam, tmp_path):

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tools.peers import __main__ as command
+from tools.peers import ours, worker
 from tools.peers import recording as recordings
-from tools.peers import worker
 from tools.peers.__main__ import Row, judge, judge_mesh, run, table
+from tools.peers.open3d_systems import _fragments
 from tools.peers.orb_vocabulary import BRANCHES, LEVELS, SMALLEST, tree
 from tools.peers.recording import Account, Recording, stored_depth
 from tools.peers.systems import PEERS, Peer
@@ -167,6 +169,41 @@ def test_command(folder, tmp_path, monkeypatch, capsys):
     assert commands[1][-2:] == ["--set", "mapping.enabled=true"] and "0:5" in commands[0]
     assert len(json.loads((tmp_path / "peers.json").read_text())) == 3
     assert command.main([str(tmp_path / "nothing")]) == 2
+
+
+def test_fragments_are_counted(tmp_path):
+    """Steps between neighbours that stand still to the bit had no odometry; loops and other files do not count."""
+    moved = np.eye(4)
+    moved[0, 3] = 0.01
+    edges = [(moved, False), (np.eye(4), False), (np.eye(4), True)]
+    graph = {"edges": [{"transformation": T.ravel().tolist(), "uncertain": uncertain} for T, uncertain in edges]}
+    for name in ("fragment_000.json", "fragment_001.json", "fragment_optimized_000.json"):
+        (tmp_path / name).write_text(json.dumps(graph))
+    assert _fragments(tmp_path) == "2 fragments, 2 of 4 steps without odometry"
+
+
+def test_ours_is_run_as_the_peers_are(folder, tmp_path, monkeypatch):
+    """Tracking alone; frames that are lost are not fused."""
+    fused = []
+    monkeypatch.setattr(ours, "fuse", lambda recording, poses, path: fused.append(poses))
+    read = Recording.__getitem__
+
+    def blinded(self, number):
+        frame = read(self, number)
+        return replace(frame, depth=np.zeros_like(frame.depth)) if number == 4 else frame
+
+    monkeypatch.setattr(Recording, "__getitem__", blinded)
+    recording = Recording(folder)
+    account = Account(recording, tmp_path)
+    ours.tracking(recording, account, True)
+    account.write()
+    row = Row("ours", cpu_seconds_a_frame=0.0)
+    judge(row, tmp_path, recording)
+    assert account.lost == [4] and row.lost == 1 and row.ate_cm < 2.0
+    assert set(account.cpu_seconds) == {"setup", "tracking", "mesh"}
+    (poses,) = fused
+    assert np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2))).tolist() == [4]
+    np.testing.assert_allclose(poses[0], recording.truth[0], atol=1e-9)
 
 
 def test_vocabulary():

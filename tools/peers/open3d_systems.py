@@ -96,7 +96,8 @@ def redwood(recording: Recording, account: Account, mesh: bool) -> None:
     """The offline pipeline of Choi, Zhou, Koltun 2015 (``open3d/examples/reconstruction_system``), unchanged.
 
     Fragments of 100 frames with a pose graph each, registration of all pairs of fragments, global optimisation,
-    refinement, integration, with the settings of its tutorial but for depth. Its own odometry tells no lost frames.
+    refinement, integration, with the settings of its tutorial but for depth. A step that its odometry
+    has no answer for is taken as none; no frame is called lost.
     """
     import cv2
     import open3d as o3d
@@ -138,6 +139,7 @@ def redwood(recording: Recording, account: Account, mesh: bool) -> None:
             runpy.run_path(str(script), run_name="__main__")
     finally:
         sys.argv = before
+    account.remarks.append(_fragments(work / "fragments"))
     poses = read_redwood_log(work / "scene/trajectory.log", len(recording))
     for pose in poses:
         account.add(pose, bool(np.isfinite(pose).all()))
@@ -145,6 +147,14 @@ def redwood(recording: Recording, account: Account, mesh: bool) -> None:
         found = o3d.io.read_triangle_mesh(str(work / "scene/integrated.ply"))
         found.transform(account.world_poses()[0] @ np.linalg.inv(poses[0]))
         o3d.io.write_triangle_mesh(str(account.out / "mesh.ply"), found)
+
+
+def _fragments(folder: Path) -> str:
+    """What the pose graphs of the fragments say: how many, and how often odometry had no answer."""
+    graphs = [json.loads(path.read_text()) for path in sorted(folder.glob("fragment_[0-9]*.json"))]
+    steps = [edge for graph in graphs for edge in graph["edges"] if not edge["uncertain"]]
+    failed = sum(bool(np.allclose(edge["transformation"], np.eye(4).ravel())) for edge in steps)
+    return f"{len(graphs)} fragments, {failed} of {len(steps)} steps without odometry"
 
 
 class _Volume:

@@ -42,6 +42,7 @@ PEERS: dict[str, Peer] = {
     "open3d-slam": Peer("Open3D SLAM", ("open3d",), "open3d", "tools.peers.open3d_systems:slam"),
     "open3d-odometry": Peer("Open3D odometry", ("open3d",), "open3d", "tools.peers.open3d_systems:odometry"),
     "redwood": Peer("Redwood pipeline", ("open3d",), "open3d", "tools.peers.open3d_systems:redwood"),
+    "warpslam-tsdf": Peer("warpslam, tracking alone + TSDF", ("open3d",), "open3d", "tools.peers.ours:tracking"),
 }
 
 CITED: tuple[tuple[str, str, str], ...] = (

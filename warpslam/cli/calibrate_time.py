@@ -10,7 +10,6 @@ from typing import Any
 
 import warp as wp
 
-from warpslam.camera import SensorTiming
 from warpslam.cli.common import add_command, add_device_option, add_format_options, parse_frames
 from warpslam.errors import ConfigError, DatasetError
 from warpslam.pipeline.setup import check_device, select_frames
@@ -49,11 +48,8 @@ def _calibrate(options: argparse.Namespace) -> int:
     estimate = find_timing(cost, sequence.timing, _report if sys.stderr.isatty() else None)
     print(describe(estimate))
     calibration = sequence.calibration
-    # The reader cuts rows off: those of the stored image take longer.
-    kept = sequence.intrinsics.height
-    stored = SensorTiming(
-        estimate.timing.depth_delay, round(estimate.timing.readout * (kept + 2 * calibration.crop) / kept, 3)
-    )
+    stored = calibration.timing_as_stored(estimate.timing)
+    stored = replace(stored, readout=round(stored.readout, 3))
     print(f"\n# {CAMERA_FILE}\ndepth_delay: {stored.depth_delay:g}\nreadout: {stored.readout:g}")
     if options.write:
         if not (estimate.depth_delay.is_determined or estimate.readout.is_determined):

@@ -215,6 +215,11 @@ class DirectConfig(_Group):
     )
     lost_view: float = Field(0.15, ge=0, le=1, description="share of the keyframe in view, for the same")
     lost_known: float = Field(0.08, ge=0, le=1, description="share of it where both have depth, for the same")
+    timing: Literal["auto", "given"] = Field(
+        "auto",
+        description="auto: delay of depth and readout time are estimated while the camera moves, where depth has "
+        "stamps of its own and the camera tells neither; given: what is not told is none",
+    )
     search_span: float = Field(24.0, gt=0, le=60, description="rotations searched, up to this [degrees]")
     search_kept: int = Field(3, ge=1, le=20, description="rotations tried further")
     search_weak: bool = Field(True, description="search along the two motions that depth determines least, too")

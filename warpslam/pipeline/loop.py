@@ -13,8 +13,10 @@ import numpy as np
 from warpslam.errors import DatasetError
 from warpslam.evaluation import ate
 from warpslam.frames import FrameStatus
+from warpslam.pipeline.metrics_files import found_timing
 from warpslam.pipeline.read_ahead import ReadAhead
 from warpslam.pipeline.results import trajectory_of
+from warpslam.runs.metrics import FoundTiming
 from warpslam.runs.record import Progress
 
 if TYPE_CHECKING:
@@ -77,6 +79,9 @@ class FrameLoop:
             self.record.add(frame.index, truth, result)
             level = logging.INFO if result.status == FrameStatus.OK else logging.WARNING
             log.log(level, "frame %d: %s", frame.index, _describe(result))
+            if result.sensor_timing:
+                found = FoundTiming.model_validate(found_timing(self.record, self.sequence))
+                log.info("the camera's timing was estimated: %s", found.text)
             fps = (len(self.record.results) - done_before) / max(time.perf_counter() - start, 1e-9)
             self.observer.frame(self._progress(result, fps))
             self.checkpoints.after_frame(frame, self.record, self.slam)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from warpslam import __version__
+from warpslam.camera import SensorTiming
 from warpslam.frames import FrameStatus
 from warpslam.runs.record import UNREADABLE, RunRecord
 from warpslam.runtime.environment import package_versions, peak_memory_mib
@@ -19,6 +20,7 @@ from warpslam.storage.json_files import write_json
 if TYPE_CHECKING:
     from warpslam.runs.folder import RunFolder
     from warpslam.runtime.compilation import ModuleProgress
+    from warpslam.sequences.base import RgbdSequence
 
 
 def figures_of_every_run(record: RunRecord, selected_count: int, modules: Sequence[ModuleProgress]) -> dict[str, Any]:
@@ -50,6 +52,16 @@ def unusable_frames(record: RunRecord) -> list[dict[str, Any]]:
         if result.status == FrameStatus.SKIPPED:
             frames.append({"frame": index, "status": FrameStatus.SKIPPED, "reason": result.message})
     return sorted(frames, key=lambda frame: frame["frame"])
+
+
+def found_timing(record: RunRecord, sequence: RgbdSequence) -> dict[str, float] | None:
+    """Field ``found_timing`` of metrics.json; None where the camera's timing was not estimated."""
+    if record.found_timing is None:
+        return None
+    frame, found = record.found_timing
+    stored = sequence.stored_timing(SensorTiming(found["depth_delay"], found["readout"]))
+    rounded = {name: round(seconds, 4) for name, seconds in vars(stored).items()}
+    return {**found, **rounded, "after_frame": frame}
 
 
 def write_timing(folder: RunFolder, record: RunRecord, modules: Sequence[ModuleProgress]) -> None:

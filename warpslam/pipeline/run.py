@@ -15,7 +15,7 @@ from warpslam.pipeline.checkpoints import Checkpoints, SavedRun, find_checkpoint
 from warpslam.pipeline.log import log_file
 from warpslam.pipeline.loop import FrameLoop
 from warpslam.pipeline.methods import has_checkpoints
-from warpslam.pipeline.metrics_files import figures_of_every_run, write_frames, write_timing
+from warpslam.pipeline.metrics_files import figures_of_every_run, found_timing, write_frames, write_timing
 from warpslam.pipeline.observer import Observer
 from warpslam.pipeline.results import (
     draw_panels,
@@ -333,6 +333,9 @@ class Run:
         )
         if checkpoints.size is not None:
             self.metrics.fill({"checkpoint": {"bytes": checkpoints.size, "every_frames": request.checkpoint_every}})
+        found = found_timing(self.record, self.sequence)
+        if found is not None:
+            self.metrics.fill({"found_timing": found})
         self.metrics.write(self.folder.metrics)
         write_timing(self.folder, self.record, self.modules)
         write_frames(self.folder, self.record)

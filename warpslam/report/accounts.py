@@ -106,6 +106,7 @@ def memory_section(run: RunData) -> Html:
 def frames_section(run: RunData) -> Html:
     """What became of the frames, and why some are not OK."""
     title = "Frames"
+    found = run.metrics.found_timing.text if run.metrics.has("found_timing") else None
     names = run.metrics.frames.by_status
     if not names:
         return section("frames", title, missing("No frame was processed."))
@@ -113,6 +114,8 @@ def frames_section(run: RunData) -> Html:
         charts.share_bar("Frames by status", [(name, f"{count} {name}", count) for name, count in names]),
         legend(*((name, f"{count} {name}") for name, count in names)),
     ]
+    if found:
+        content.append(element("p", f"The camera's timing was estimated: {found}."))
     record = run.record
     bad = [
         (n, str(result.status), result.message or "–") for n, result in record.frames if result.status != FrameStatus.OK

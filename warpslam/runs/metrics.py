@@ -79,6 +79,29 @@ class Checkpoint(_Part):
     every_frames: int | None = Field(None, description="frames between two")
 
 
+class FoundTiming(_Part):
+    """The camera's timing as the run found it, as camera.yaml takes it."""
+
+    depth_delay: Number = Field(None, description="time of depth minus time of colour, beyond their stamps [s]")
+    depth_delay_sigma: Number = Field(None, description="its standard deviation [s]")
+    readout: Number = Field(None, description="time from the first to the last row [s]")
+    readout_sigma: Number = Field(None, description="its standard deviation [s]")
+    after_frame: int | None = Field(None, description="it is used after this frame, a number in the sequence")
+
+    @property
+    def text(self) -> str:
+        """In a line."""
+        values = [
+            f"{name} {value:.4f} +- {sigma or 0:.4f} s"
+            for name, value, sigma in (
+                ("depth_delay", self.depth_delay, self.depth_delay_sigma),
+                ("readout", self.readout, self.readout_sigma),
+            )
+            if value is not None
+        ]
+        return f"{', '.join(values)}, used after frame {self.after_frame}"
+
+
 class Statistics(_Part):
     """An error over all frames or pairs of frames."""
 
@@ -228,6 +251,7 @@ class RunMetrics(Errors):
     resumed_after: int | None = Field(None, description="frames that were taken over from a checkpoint")
     input_checks: list[InputCheck] = Field(default_factory=list, description="what the checks of the input found")
     checkpoint: Checkpoint = _part(Checkpoint, "checkpoints of the run")
+    found_timing: FoundTiming = _part(FoundTiming, "timing of the camera, where it was estimated")
     map: MapSize = _part(MapSize, "what the map takes")
     levels: dict[str, Level] = Field(default_factory=dict, description="feature grids by level")
     bounds_m: list[list[Number]] | None = Field(None, description="lower and upper corner of the grids [m]")

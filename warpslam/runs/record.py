@@ -110,6 +110,14 @@ class RunRecord:
         return np.array(self.truth_poses, np.float64).reshape(-1, 4, 4)
 
     @property
+    def found_timing(self) -> tuple[int, dict[str, float]] | None:
+        """Number in the sequence of the frame that completed the last estimate of the camera's timing, and that
+        estimate as `FrameResult.sensor_timing` has it; None where there is none.
+        """
+        found = [(index, result.sensor_timing) for index, result in self.frames if result.sensor_timing]
+        return found[-1] if found else None
+
+    @property
     def has_truth(self) -> bool:
         """Whether the true pose of a frame is known."""
         return bool(np.isfinite(self.truth).all(axis=(1, 2)).any())

@@ -29,12 +29,14 @@ _STAGES = (
     "kernels.grid",
     "views",
     "direct",
+    "timing",
     "features",
 )
 _PYTHON_MODULES = {
     "warpslam.rays": ("pixels", "rays", "rejection", "samples"),
     "warpslam.views": ("frustum", "images", "rectify", "seen", "visibility"),
     "warpslam.direct": ("direct.images", "direct.points", "direct.registration"),
+    "warpslam.timing": ("direct.timing",),
     "warpslam.features": ("features.matching", "features.pose", "features.agreement"),
     **{f"warpslam.decoder_{target}": ("decoder.build",) for target in ("cpu", "cuda")},
     **{f"warpslam.imap_{target}": ("imap_network",) for target in ("cpu", "cuda")},

@@ -59,6 +59,10 @@ class RgbdSequence(ABC):
         """The sequence with frames as the paper's code takes them; itself where that makes no difference."""
         return self
 
+    def stored_timing(self, timing: SensorTiming) -> SensorTiming:
+        """What ``camera.yaml`` should say of a camera whose frames, as returned, have a timing."""
+        return timing
+
     def ground_truth(self) -> np.ndarray | None:
         """All ground-truth poses, float64, shape (N, 4, 4), NaN-filled where one is unknown; None if there are none."""
         return None

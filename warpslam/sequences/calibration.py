@@ -57,6 +57,11 @@ class Calibration:
         rows = self.intrinsics.height
         return replace(self.stored_timing, readout=self.stored_timing.readout * rows / (rows + 2 * self.crop))
 
+    def timing_as_stored(self, timing: SensorTiming) -> SensorTiming:
+        """The timing of the images as stored, by that of the frames as returned."""
+        rows = self.intrinsics.height
+        return replace(timing, readout=timing.readout * (rows + 2 * self.crop) / rows)
+
     def as_published(self) -> Calibration:
         """With frames resized and cropped as in the paper's code, and depth left as it is stored."""
         return replace(

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warpslam.camera import SensorTiming
 from warpslam.errors import DatasetError
 from warpslam.sequences.base import Frame, RgbdSequence
 from warpslam.sequences.calibration import Calibration
@@ -80,6 +81,10 @@ class FileSequence(RgbdSequence):
         published.calibration = self.calibration.as_published()
         published.intrinsics, published.timing = published.calibration.intrinsics, published.calibration.timing
         return published
+
+    def stored_timing(self, timing: SensorTiming) -> SensorTiming:
+        """See `RgbdSequence.stored_timing`: rows that are cut off take their time, too."""
+        return self.calibration.timing_as_stored(timing)
 
     def __len__(self) -> int:
         return len(self._rgb_files)

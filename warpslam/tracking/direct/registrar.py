@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpslam.kernels.direct import equations, images, map_rows, points, registration
+from warpslam.kernels.direct import equations, images, map_rows, points, registration, timing
 from warpslam.runtime.launching import Launcher, Step
 from warpslam.tracking.direct.pyramid import PyramidPlan, records
 
@@ -312,6 +312,15 @@ class Registrar:
     def _sum_pairs(self, level: int, count: int, pairs: wp.array, grey: float, depth: float, sums: wp.array) -> None:
         before = [self._levels, level, grey, depth, self._floors, self.points, self._images, self._motions, pairs]
         self._by_groups(registration.sum_pairs, count, before, sums)
+
+    def timing(self, level: int, pairs: np.ndarray, grey: float, depth: float) -> np.ndarray:
+        """What `timing.TimedPair`s say of the camera's timing at a level, one `timing.TimedSums` each."""
+        count = len(pairs)
+        sums = self._array("timed_sums", timing.TimedSums, count)
+        before = [self._levels, level, grey, depth, self._floors, self.points, self._images, self._motions]
+        before.append(self._upload("timed_pairs", timing.TimedPair, pairs))
+        self._by_groups(timing.sum_timing, count, before, sums)
+        return np.array(sums.numpy()[:count])
 
     def rotations(self, smallest: np.ndarray, row: int, candidates: np.ndarray) -> np.ndarray:
         """1 - correlation of the smallest images under each rotation (n, 3, 3), of each of ``smallest`` (k, pixels)

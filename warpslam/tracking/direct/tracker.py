@@ -10,14 +10,14 @@ refined together (`warpslam.tracking.direct.window`); frames hang on their keyfr
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warpslam.camera import NO_MOTION, FrameMotion, Intrinsics
+from warpslam.camera import NO_MOTION, FrameMotion, Intrinsics, TimingChange
 from warpslam.config import DirectConfig
 from warpslam.field.arrays import FieldArrays
 from warpslam.frames import AdmittedFrame
@@ -903,6 +903,36 @@ class DirectTracker:
             return list(range(len(poses)))
         step, turn = motion_between(poses, np.broadcast_to(pose, poses.shape)).T
         return sorted(np.argsort(step + DEGREE * turn, kind="stable")[:NEAR_KEYFRAMES].tolist())
+
+    # -- what is asked of it from outside ------------------------------------------------------------------------
+
+    @property
+    def overlap(self) -> dict[int, float]:
+        """Share of the points of a keyframe that the last frame sees, by keyframe."""
+        return self._overlap
+
+    def row_of(self, index: int) -> int | None:
+        """Where the images of a frame are; None if they are gone."""
+        return self._row_of.get(index)
+
+    def points_of(self, keyframe: int) -> int:
+        """Row of a keyframe's points."""
+        return self._points_of(keyframe)
+
+    def retime(self, change: TimingChange, twists: Mapping[int, np.ndarray], first: int = 0) -> None:
+        """The camera sees otherwise than was believed: its keyframes and the last frames are corrected for it.
+
+        change: By which delay and readout grow. twists: Of keyframes where they are known, by frame. first: The first
+        frame that it took.
+        """
+        self.readout += change.readout
+        for index, motion in list(self._motions.items()):
+            if index in self._row_of:
+                self._set_motion(index, motion.retimed(change))
+        for number, keyframe in enumerate(self.keyframes):
+            if keyframe.index >= first:
+                keyframe.motion = keyframe.motion.retimed(change)
+                self._correct_keyframe(number, twists.get(keyframe.index, np.array(keyframe.motion.twist)))
 
     # -- frames --------------------------------------------------------------------------------------------------
 
