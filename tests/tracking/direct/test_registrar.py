@@ -69,7 +69,7 @@ def test_points_lie_on_the_surface_with_its_normals(bench):
     """Those of the box: every point on a wall or the column, normals along its axes, towards the camera."""
     bench.load(0, START)
     bench.registrar.select(0, 1)
-    kept = bench.registrar._points
+    kept = bench.registrar.points
     X, N = kept.position[1].numpy(), kept.normal[1].numpy()
     valid = X[:, 2] > 0
     assert valid.mean() > 0.9
