@@ -21,6 +21,7 @@ from warpslam.field.decoder_files import load_decoders
 from warpslam.field.decoders import Decoders
 from warpslam.field.rendering import RenderedImage, render_image
 from warpslam.frames import AdmittedFrame, FrameResult, FrameStatus, admit, check_settings, skipped
+from warpslam.loops.closer import LoopCloser
 from warpslam.mapping.frustum import measured_extent
 from warpslam.mapping.mapper import Mapper
 from warpslam.mapping.scheduler import MappingTask, new_scheduler
@@ -98,6 +99,7 @@ class Slam:
         self.localizer = Localizer(self.tracker, self.config.tracking, intrinsics)
         self.mapper = Mapper(self.scene, intrinsics, self.config.mapping, self.config.sampling, self.device, seed)
         self.direct = self._direct_tracker()
+        self.loops = self._loop_closer()
         self.timing_estimator = self._timing_estimator()
         self.scheduler = new_scheduler(self.config.schedule, self.mapper, self.images)
         self._seen: list[SeenDepth] = []
@@ -153,6 +155,7 @@ class Slam:
         self.history.add(frame.timestamp, located)
         self._digest = digest
         found = self._estimate_timing(frame, account)
+        self._close_loops(account)
         self._note_motion(frame)  # what is mapped and kept are images of one moment
         if located.status is FrameStatus.OK and self.config.mapping.enabled:
             is_keyframe = self._is_keyframe(frame)  # Sec. 3.4
@@ -218,6 +221,12 @@ class Slam:
         return DirectTracker(
             self.intrinsics, self.config.direct, max_depth, self.device, self.keyframes, self.images, readout
         )
+
+    def _loop_closer(self) -> LoopCloser | None:
+        """What closes loops; with direct tracking alone, whose keyframes lie to each other as they were registered."""
+        if self.direct is None or not self.config.loops.enabled:
+            return None
+        return LoopCloser(self.direct, self.images, self.config.loops)
 
     def _timing_estimator(self, first: int = 0) -> TimingEstimator | None:
         """What estimates the camera's timing from frame ``first`` on, where nothing is known of it."""
@@ -325,6 +334,12 @@ class Slam:
                 known = {index: twist for index, twist in twists.items() if twist is not None}
                 direct.retime(change, known, estimator.first)
         return found.to_dict()
+
+    def _close_loops(self, account: _Account) -> None:
+        """Compare new keyframes with what was seen long ago, and mend the poses of all."""
+        if self.loops is not None and self.loops.has_new:
+            with account.timed("loops"):
+                self.loops.look(self.history)
 
     def _note_motion(self, frame: AdmittedFrame) -> None:
         """Rectify the current image by how the camera came to its pose; and tell a keyframe just before of what came
@@ -470,7 +485,8 @@ class Slam:
 
     def inventory(self) -> dict[str, Any]:
         """Figures of the map for metrics.json; see `warpslam.scene.inventory.take_inventory`."""
-        return take_inventory(self.scene, self.images, self.keyframes, self._seen, self.views)
+        found = take_inventory(self.scene, self.images, self.keyframes, self._seen, self.views)
+        return found if self.loops is None else {**found, "loops": self.loops.account()}
 
     # -- saved ---------------------------------------------------------------------------------------------------
 
@@ -533,6 +549,7 @@ class Slam:
             direct=None if self.direct is None else self.direct.state(),
             digest=self._digest,
             timing_state=None if self.timing_estimator is None else self.timing_estimator.state(),
+            loops=None if self.loops is None else self.loops.state(),
         )
 
     @classmethod
@@ -562,6 +579,11 @@ class Slam:
                 direct.fixed = len(slam.keyframes)
             if direct is not None and state.direct is not None:
                 direct.restore(state.direct, state.current)
+            slam.loops = slam._loop_closer()
+            if slam.loops is not None and state.loops is not None:
+                slam.loops.restore(state.loops)
+            elif slam.loops is not None:
+                slam.loops.take_up()
         slam.timing_estimator = slam._timing_estimator(len(slam.history))
         if slam.direct is not None and state.timing_state is not None:
             slam.timing_estimator = TimingEstimator.restored(state.timing_state, state.timing)

@@ -1,0 +1,184 @@
+"""The pose graph over keyframes: what tracking and loops say of pairs of them, and the poses that fit all of it best.
+
+An edge (i, j) says T_i_j = W_i^-1 W_j, uncertain by exp(e) on its right, e = (v, w). Edges of tracking are believed.
+Those of loops are weighed by graduated non-convexity with truncated least squares (Yang et al., RA-L 2020; GTSAM): one
+that the others contradict ends with weight 0, however far it would pull, and whatever the start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from warpslam.errors import ConfigError
+from warpslam.poses import adjoint, inverse, twist_of
+
+FLOOR = 1e-3, 5e-4
+"""Standard deviations [m], [rad] that no edge is better than: errors that images of one camera have in common."""
+HELD = 1e-5
+"""Standard deviation of a pose that stays where it is [m, rad]."""
+LEAST_WEIGHT = 0.5
+"""Of a loop that counts."""
+CONFIDENCE = 0.99
+"""Probability with which an edge that is right counts."""
+_GTSAM_ORDER = [3, 4, 5, 0, 1, 2]
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """What is known of two keyframes."""
+
+    T_i_j: np.ndarray
+    """float64 (4, 4)."""
+    covariance: np.ndarray
+    """Of e, float64 (6, 6)."""
+
+    @classmethod
+    def of(cls, T_i_j: np.ndarray, covariance: np.ndarray) -> Edge:
+        """With `FLOOR` added to the covariance."""
+        floor = np.diag([FLOOR[0] ** 2] * 3 + [FLOOR[1] ** 2] * 3)
+        return cls(T_i_j, 0.5 * (covariance + covariance.T) + floor)
+
+    def squared_error(self, W_i: np.ndarray, W_j: np.ndarray) -> float:
+        """Squared Mahalanobis distance of two poses from it."""
+        e = twist_of(inverse(self.T_i_j) @ inverse(W_i) @ W_j)
+        return float(e @ np.linalg.solve(self.covariance, e))
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Poses that fit the edges."""
+
+    poses: np.ndarray
+    """float64 (N, 4, 4)."""
+    weights: dict[tuple[int, int], float]
+    """Of each loop, in [0, 1]."""
+
+
+class PoseGraph:
+    """Edges between keyframes, by their numbers, the lower one first."""
+
+    def __init__(self) -> None:
+        self.tracked: dict[tuple[int, int], Edge] = {}
+        self.loops: dict[tuple[int, int], Edge] = {}
+
+    def track(self, i: int, j: int, T_i_j: np.ndarray, covariance: np.ndarray) -> None:
+        """Tracking says how two keyframes lie to each other; what it said before is replaced."""
+        self.tracked[min(i, j), max(i, j)] = _ordered(i, j, T_i_j, covariance)
+
+    def close(self, i: int, j: int, T_i_j: np.ndarray, covariance: np.ndarray) -> None:
+        """A loop does."""
+        self.loops[min(i, j), max(i, j)] = _ordered(i, j, T_i_j, covariance)
+
+    def are_linked(self, i: int, j: int) -> bool:
+        """Whether there is an edge."""
+        pair = min(i, j), max(i, j)
+        return pair in self.tracked or pair in self.loops
+
+    def way(self, start: int, count: int) -> np.ndarray:
+        """Length of the shortest way along edges from one of ``count`` keyframes to each [m], infinite where there is
+        none, float64 (count,).
+        """
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import dijkstra
+
+        edges = self.tracked | self.loops
+        if not edges:
+            return np.where(np.arange(count) == start, 0.0, np.inf)
+        i, j = np.array(list(edges)).T
+        # An edge of no length would be none.
+        length = [max(float(np.linalg.norm(edge.T_i_j[:3, 3])), 1e-3) for edge in edges.values()]
+        return np.asarray(dijkstra(coo_array((length, (i, j)), (count, count)).tocsr(), directed=False, indices=start))
+
+    def _first_of_each_part(self, count: int, fixed: int) -> list[int]:
+        """First keyframe of each part of the graph that has none of the first ``fixed``."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        i, j = np.array(list(self.tracked | self.loops), np.int64).reshape(-1, 2).T
+        _, parts = connected_components(coo_array((np.ones(len(i)), (i, j)), (count, count)), directed=False)
+        _, first = np.unique(parts, return_index=True)
+        return [n for n in first.tolist() if n >= fixed]
+
+    def solve(self, poses: Sequence[np.ndarray] | np.ndarray, fixed: int = 0) -> Solution:
+        """Poses (N, 4, 4) that fit all edges best, from ``poses`` on; the first ``fixed`` stay where they are, and of
+        each part of the graph without any of these the first.
+
+        Raises:
+            ConfigError: GTSAM is not installed.
+        """
+        gtsam = import_gtsam()
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for n, pose in enumerate(poses):
+            values.insert(n, gtsam.Pose3(np.asarray(pose, np.float64)))
+        held = gtsam.noiseModel.Isotropic.Sigma(6, HELD)
+        for n in sorted({*range(fixed), *self._first_of_each_part(len(poses), fixed)}):
+            graph.add(gtsam.PriorFactorPose3(n, values.atPose3(n), held))
+        for edges in (self.tracked, self.loops):
+            for (i, j), edge in edges.items():
+                noise = gtsam.noiseModel.Gaussian.Covariance(_in_gtsam_order(edge.covariance))
+                graph.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(edge.T_i_j), noise))
+        first_loop = graph.size() - len(self.loops)
+        weights = np.ones(graph.size())
+        if self.loops:
+            params = gtsam.GncLMParams()
+            params.setKnownInliers(list(range(first_loop)))
+            params.setLossType(gtsam.GncLossType.TLS)
+            optimizer = gtsam.GncLMOptimizer(graph, values, params)
+            optimizer.setInlierCostThresholdsAtProbability(CONFIDENCE)
+            found, weights = optimizer.optimize(), np.asarray(optimizer.getWeights())
+        else:
+            found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        solved = np.array([found.atPose3(n).matrix() for n in range(len(poses))])
+        by_loop = dict(zip(self.loops, weights[first_loop:].tolist(), strict=True))
+        return Solution(solved, by_loop)
+
+
+def import_gtsam() -> Any:
+    """The package that solves pose graphs.
+
+    Raises:
+        ConfigError: It is not installed.
+    """
+    try:
+        import gtsam
+    except ImportError:
+        raise ConfigError(
+            'loops need the package gtsam: pip install "warpslam[loops]", or loops.enabled=false'
+        ) from None
+    return gtsam
+
+
+def edges_to_arrays(edges: Mapping[tuple[int, int], Edge]) -> dict[str, np.ndarray]:
+    """Edges as plain arrays: "pairs" int64 (n, 2), "transforms" and "covariances", float64."""
+    return {
+        "pairs": np.array(list(edges), np.int64).reshape(-1, 2),
+        "transforms": np.array([edge.T_i_j for edge in edges.values()], np.float64).reshape(-1, 4, 4),
+        "covariances": np.array([edge.covariance for edge in edges.values()], np.float64).reshape(-1, 6, 6),
+    }
+
+
+def edges_from_arrays(
+    pairs: np.ndarray, transforms: np.ndarray, covariances: np.ndarray
+) -> dict[tuple[int, int], Edge]:
+    """What `edges_to_arrays` was given."""
+    return {
+        (i, j): Edge(T.copy(), covariance.copy())
+        for (i, j), T, covariance in zip(pairs.tolist(), transforms, covariances, strict=True)
+    }
+
+
+def _ordered(i: int, j: int, T_i_j: np.ndarray, covariance: np.ndarray) -> Edge:
+    """The edge with the lower number first: T^-1 exp(e') where T exp(e) was, so e' = -Ad(T) e."""
+    if i < j:
+        return Edge.of(T_i_j, covariance)
+    A = adjoint(T_i_j)
+    return Edge.of(inverse(T_i_j), A @ covariance @ A.T)
+
+
+def _in_gtsam_order(covariance: np.ndarray) -> np.ndarray:
+    """Of a twist (w, v)."""
+    return covariance[np.ix_(_GTSAM_ORDER, _GTSAM_ORDER)]
