@@ -7,17 +7,21 @@ that the others contradict ends with weight 0, however far it would pull, and wh
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from warpslam.errors import ConfigError
-from warpslam.poses import adjoint, inverse, twist_of
+from warpslam.poses import adjoint, inverse, motion_between, twist_of
 
-FLOOR = 1e-3, 5e-4
-"""Standard deviations [m], [rad] that no edge is better than: errors that images of one camera have in common."""
+LOOP_FLOOR = 3e-3, 2e-3
+"""Standard deviations [m], [rad] that no loop is better than: views differ much, and a camera's errors with them."""
+STEP_FLOOR, STEP_DRIFT = (2e-3, 2e-3), 0.05
+"""The same of neighbours, and what adds to it for a metre or radian between them. Drift is no chance: errors of
+neighbours add up, so what one registration knows of itself would not let a loop of 30 m close.
+"""
 HELD = 1e-5
 """Standard deviation of a pose that stays where it is [m, rad]."""
 LEAST_WEIGHT = 0.5
@@ -37,10 +41,13 @@ class Edge:
     """Of e, float64 (6, 6)."""
 
     @classmethod
-    def of(cls, T_i_j: np.ndarray, covariance: np.ndarray) -> Edge:
-        """With `FLOOR` added to the covariance."""
-        floor = np.diag([FLOOR[0] ** 2] * 3 + [FLOOR[1] ** 2] * 3)
-        return cls(T_i_j, 0.5 * (covariance + covariance.T) + floor)
+    def of(cls, i: int, j: int, T_i_j: np.ndarray, covariance: np.ndarray, floor: tuple[float, float]) -> Edge:
+        """With the lower number first, and ``floor`` [m], [rad] added to the covariance."""
+        if i > j:  # T^-1 exp(e') where T exp(e) was: e' = -Ad(T) e
+            A = adjoint(T_i_j)
+            T_i_j, covariance = inverse(T_i_j), A @ covariance @ A.T
+        least = np.diag([floor[0] ** 2] * 3 + [floor[1] ** 2] * 3)
+        return cls(T_i_j, 0.5 * (covariance + covariance.T) + least)
 
     def squared_error(self, W_i: np.ndarray, W_j: np.ndarray) -> float:
         """Squared Mahalanobis distance of two poses from it."""
@@ -67,11 +74,19 @@ class PoseGraph:
 
     def track(self, i: int, j: int, T_i_j: np.ndarray, covariance: np.ndarray) -> None:
         """Tracking says how two keyframes lie to each other; what it said before is replaced."""
-        self.tracked[min(i, j), max(i, j)] = _ordered(i, j, T_i_j, covariance)
+        step, turn = motion_between(np.eye(4), T_i_j)
+        floor = STEP_FLOOR[0] + STEP_DRIFT * float(step), STEP_FLOOR[1] + STEP_DRIFT * float(np.radians(turn))
+        self.tracked[min(i, j), max(i, j)] = Edge.of(i, j, T_i_j, covariance, floor)
 
     def close(self, i: int, j: int, T_i_j: np.ndarray, covariance: np.ndarray) -> None:
         """A loop does."""
-        self.loops[min(i, j), max(i, j)] = _ordered(i, j, T_i_j, covariance)
+        self.loops[min(i, j), max(i, j)] = Edge.of(i, j, T_i_j, covariance, LOOP_FLOOR)
+
+    def settle(self, numbers: Collection[int], poses: Callable[[int], np.ndarray]) -> None:
+        """Tracking has moved keyframes and believes how they lie to all others now; ``poses``: of a number, (4, 4)."""
+        for (i, j), edge in self.tracked.items():
+            if i in numbers or j in numbers:
+                self.tracked[i, j] = replace(edge, T_i_j=inverse(poses(i)) @ poses(j))
 
     def are_linked(self, i: int, j: int) -> bool:
         """Whether there is an edge."""
@@ -169,14 +184,6 @@ def edges_from_arrays(
         (i, j): Edge(T.copy(), covariance.copy())
         for (i, j), T, covariance in zip(pairs.tolist(), transforms, covariances, strict=True)
     }
-
-
-def _ordered(i: int, j: int, T_i_j: np.ndarray, covariance: np.ndarray) -> Edge:
-    """The edge with the lower number first: T^-1 exp(e') where T exp(e) was, so e' = -Ad(T) e."""
-    if i < j:
-        return Edge.of(T_i_j, covariance)
-    A = adjoint(T_i_j)
-    return Edge.of(inverse(T_i_j), A @ covariance @ A.T)
 
 
 def _in_gtsam_order(covariance: np.ndarray) -> np.ndarray:

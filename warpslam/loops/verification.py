@@ -1,9 +1,9 @@
 """Whether two keyframes show one place: three gates, each of which must be passed, and what is known then.
 
-Geometry: features of one, at its depth, are seen by the other where one pose has them. Depth: what each measured lies
-where the other measured, and next to none of it in space that the other saw empty. Registration: direct registration
-of each to the other comes to the same pose, with depth and grey values agreeing both ways, no direction left open, and
-the frame not looking the same elsewhere along directions that depth leaves open
+Geometry: features of one, at its depth, are seen by the other where one pose has them. Registration: from there direct
+registration of each to the other comes to the same pose, with depth and grey values agreeing both ways, and no
+direction left open. Depth: what each measured lies where the other measured, and next to none of it in space that the
+other saw empty; and the frame does not look the same elsewhere along directions that depth leaves open
 (`warpslam.tracking.direct.aliases`). The number of inliers alone proves nothing: opposite sides of a symmetric box have
 more of them than two views of one side.
 """
@@ -54,8 +54,8 @@ class Gate(StrEnum):
     """What a candidate failed at, or all it passed."""
 
     GEOMETRY = "geometry"
-    DEPTH = "depth"
     REGISTRATION = "registration"
+    DEPTH = "depth"
     UNIQUE = "unique"
     PLAUSIBLE = "plausible"
     """That tracking may have drifted so far; asked by who knows the way between."""
@@ -132,17 +132,15 @@ class Verifier:
     def by_images(self, a: int, b: int, T_a_b: np.ndarray) -> Verdict:
         """The other gates, from where b is about."""
         registered = self._registered(a, b, T_a_b)
-        if registered.T_a_b is None or registered.covariance is None:
-            return registered
         T = registered.T_a_b
+        if registered.gate is not Gate.PASSED or T is None:
+            return registered
         A, B = self.features.of(a).thin_depth, self.features.of(b).thin_depth
         camera, max_depth = self.tracker.camera.strided(DEPTH_STRIDE), self.tracker.registrar.max_depth
         for one, other, T_other_one in ((A, B, inverse(T)), (B, A, T)):
             seen, empty = depth_consistency(one, other, T_other_one, camera, max_depth)
             if seen < LEAST_SEEN or empty > MOST_EMPTY:
-                return Verdict(Gate.DEPTH, f"{seen:.0%} measured by both, {empty:.1%} of it where one saw nothing")
-        if registered.gate is not Gate.PASSED:
-            return registered
+                return Verdict(Gate.DEPTH, f"{seen:.0%} measured by both, {empty:.1%} of it where one saw nothing", T)
         weights = self.tracker.config.grey_weight, self.tracker.config.depth_weight
         elsewhere = difference_elsewhere(
             self.tracker.registrar, self.tracker.keyframe_row(b), SCRATCH, weights, SAME_STEP

@@ -227,6 +227,9 @@ class Hooks(Protocol):
         covariance (6, 6).
         """
 
+    def refined(self, window: Sequence[int]) -> None:
+        """Keyframes were refined together, and `link` was told of their pairs."""
+
     def serves_again(self, old: int, reference: int) -> bool:
         """Whether a keyframe that is seen again may become the reference after another, or a new one is wanted."""
 
@@ -909,6 +912,8 @@ class DirectTracker:
         self.move_keyframes(dict(zip(active, refined.poses, strict=True)), history)
         for (i, j), H in refined.information.items():
             self._link(active[i], active[j], inverse(refined.poses[i]) @ refined.poses[j], covariance_of(H))
+        if self.hooks is not None:
+            self.hooks.refined(active)
 
     def _link(self, i: int, j: int, T_i_j: np.ndarray, covariance: np.ndarray) -> None:
         if self.hooks is not None:
