@@ -132,24 +132,32 @@ class PoseGraph:
         held = gtsam.noiseModel.Isotropic.Sigma(6, HELD)
         for n in sorted({*range(fixed), *self._first_of_each_part(len(poses), fixed)}):
             graph.add(gtsam.PriorFactorPose3(n, values.atPose3(n), held))
-        for edges in (self.tracked, self.loops):
-            for (i, j), edge in edges.items():
-                noise = gtsam.noiseModel.Gaussian.Covariance(_in_gtsam_order(edge.covariance))
-                graph.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(edge.T_i_j), noise))
-        first_loop = graph.size() - len(self.loops)
-        weights = np.ones(graph.size())
-        if self.loops:
-            params = gtsam.GncLMParams()
-            params.setKnownInliers(list(range(first_loop)))
-            params.setLossType(gtsam.GncLossType.TLS)
-            optimizer = gtsam.GncLMOptimizer(graph, values, params)
-            optimizer.setInlierCostThresholdsAtProbability(CONFIDENCE)
-            found, weights = optimizer.optimize(), np.asarray(optimizer.getWeights())
-        else:
-            found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
-        solved = np.array([found.atPose3(n).matrix() for n in range(len(poses))])
-        by_loop = dict(zip(self.loops, weights[first_loop:].tolist(), strict=True))
-        return Solution(solved, by_loop)
+        for pair, edge in self.tracked.items():
+            graph.add(_factor(gtsam, pair, edge))
+        weights = self._weights(gtsam, graph, values)
+        for pair, edge in self.loops.items():
+            if weights[pair] >= LEAST_WEIGHT:
+                graph.add(_factor(gtsam, pair, edge))
+        found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+        return Solution(np.array([found.atPose3(n).matrix() for n in range(len(poses))]), weights)
+
+    def _weights(self, gtsam: Any, tracked: Any, values: Any) -> dict[tuple[int, int], float]:
+        """Of each loop. What is left of one that lies would still pull, by metres over millimetres: it is no solution
+        yet.
+        """
+        if not self.loops:
+            return {}
+        graph = gtsam.NonlinearFactorGraph(tracked)
+        for pair, edge in self.loops.items():
+            graph.add(_factor(gtsam, pair, edge))
+        params = gtsam.GncLMParams()
+        params.setKnownInliers(list(range(tracked.size())))
+        params.setLossType(gtsam.GncLossType.TLS)
+        optimizer = gtsam.GncLMOptimizer(graph, values, params)
+        optimizer.setInlierCostThresholdsAtProbability(CONFIDENCE)
+        optimizer.optimize()
+        found = np.asarray(optimizer.getWeights())[tracked.size() :]
+        return dict(zip(self.loops, found.tolist(), strict=True))
 
 
 def import_gtsam() -> Any:
@@ -186,6 +194,8 @@ def edges_from_arrays(
     }
 
 
-def _in_gtsam_order(covariance: np.ndarray) -> np.ndarray:
-    """Of a twist (w, v)."""
-    return covariance[np.ix_(_GTSAM_ORDER, _GTSAM_ORDER)]
+def _factor(gtsam: Any, pair: tuple[int, int], edge: Edge) -> Any:
+    """An edge, whose covariance is of a twist (w, v) there."""
+    covariance = edge.covariance[np.ix_(_GTSAM_ORDER, _GTSAM_ORDER)]
+    noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    return gtsam.BetweenFactorPose3(*pair, gtsam.Pose3(edge.T_i_j), noise)
