@@ -50,6 +50,17 @@ def test_neighbours_and_what_came_later_are_left_out():
     assert index.likeliest(words, 3, before=0) == []
 
 
+def test_what_stands_out_of_nothing_is_no_place():
+    """Where all images share about as many words, none is the place; one that shares twice as many is."""
+    index = PlaceIndex()
+    for n in range(9):
+        index.add(Words.of(seen_again(place(1), n, share=0.5)))
+    words = Words.of(place(1))
+    assert index.likeliest(words, 3, least=1.4) == []
+    index.add(Words.of(seen_again(place(1), 99, bits=5, share=0.9)))
+    assert index.likeliest(words, 3, least=1.4) == [9]
+
+
 def test_memory_is_bounded_and_answers_repeat():
     first, second = PlaceIndex(), PlaceIndex()
     size = first.bytes

@@ -32,6 +32,10 @@ WINDOW_SPAN = 2 * GAP
 NEARBY, NEXT_TO = 5, 2
 """Keyframes around a member of a loop that it joins; around one that is compared, whose comparison would say the same.
 """
+STAND_OUT = 1.4
+"""Words that a known place shares, over the median of all keyframes: 1.0 to 1.5 where the best one is another place,
+1.5 to 6 where it is the same (a walk through a house).
+"""
 LEAST_OVERLAP = 0.3
 """Share of a keyframe that another one must see for both to be compared without a word in common."""
 NEWS = 12.6
@@ -184,7 +188,7 @@ class LoopCloser:
             return []
         near = {k: share for k, share in self.tracker.overlap.items() if k < before and share > LEAST_OVERLAP}
         expected = sorted(near, key=lambda k: -near[k])[:1]
-        alike = self.index.likeliest(words, self.config.candidates, before)
+        alike = self.index.likeliest(words, self.config.candidates, before, least=STAND_OUT)
         found: list[int] = []
         for k in [*expected, *alike]:
             if not self.graph.are_linked(k, number) and all(abs(k - other) > NEXT_TO for other in found):

@@ -74,7 +74,9 @@ class PlaceIndex:
         entries = self._table[words.slots]
         return np.bincount(entries[entries >= 0], minlength=self._count)
 
-    def likeliest(self, words: Words, count: int, before: int | None = None, apart: int = 2) -> list[int]:
+    def likeliest(
+        self, words: Words, count: int, before: int | None = None, apart: int = 2, least: float = 0.0
+    ) -> list[int]:
         """Numbers of the images that share most words, the likeliest first.
 
         Args:
@@ -82,11 +84,13 @@ class PlaceIndex:
             count: At most.
             before: Only images with lower numbers count.
             apart: Neighbours of one that was chosen, by number, are not.
+            least: Multiple of the median of these that must be shared: unlike places share words, too.
         """
         shared = self.shared(words)[: self._count if before is None else max(before, 0)]
+        enough = least * float(np.median(shared)) if len(shared) else 0.0
         found: list[int] = []
         for n in np.argsort(-shared, kind="stable").tolist():
-            if len(found) == count or shared[n] == 0:
+            if len(found) == count or shared[n] <= enough:
                 break
             if all(abs(n - other) > apart for other in found):
                 found.append(n)
