@@ -106,6 +106,14 @@ def test_another_room_does_not():
     assert slam.loops.verifier.by_features(0, 1).gate is Gate.GEOMETRY
 
 
+def test_a_room_with_a_post_is_another_one():
+    """Features and registration agree; what one measured on the post lies where the other saw as far as the wall."""
+    bare, post = SweptRoom(grain=25.0), SweptRoom(pillar=0.1, grain=25.0)
+    slam = keyframes(CAMERA, [(np.eye(4), room(np.eye(4), bare)), (np.eye(4), room(MOVED, post))])
+    assert slam.loops.verifier.by_features(0, 1).gate is Gate.PASSED
+    assert slam.loops.verifier.by_images(0, 1, MOVED).gate is Gate.DEPTH
+
+
 @pytest.mark.parametrize("shift", [0.0, TILE])
 def test_a_wall_of_equal_tiles_proves_no_place(shift):
     """A tile further on all fits as well, so not even the right pose is believed; pictures tell."""
