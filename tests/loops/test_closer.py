@@ -98,7 +98,7 @@ def test_two_rooms_alike_are_not_joined(frames):
     offset = motion_of(np.array([6.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
     for n in range(14):
         slam.forget_pose()
-        slam.step(*frames[2 * n], T_world_camera=motion_of(np.array([0.0, 0.0, 0.0, 0.0, 0.2 * n, 0.0])))
+        slam.step(*frames[4 * n], T_world_camera=motion_of(np.array([0.0, 0.0, 0.0, 0.0, 0.2 * n, 0.0])))
     slam.forget_pose()
     slam.step(*frames[1], T_world_camera=offset)
     seen = [entry for entry in slam.loops.log if entry["frames"][1] == 14]

@@ -32,6 +32,8 @@ WINDOW_SPAN = 2 * GAP
 NEARBY, NEXT_TO = 5, 2
 """Keyframes around a member of a loop that it joins; around one that is compared, whose comparison would say the same.
 """
+NEAR = 2.0, 60.0
+"""Poses of such keyframes are no further apart [m], [degrees]."""
 STAND_OUT = 1.4
 """Words that a known place shares, over the median of all keyframes: 1.0 to 1.5 where the best one is another place,
 1.5 to 6 where it is the same (a walk through a house).
@@ -186,7 +188,7 @@ class LoopCloser:
         before = number - GAP
         if before <= 0:
             return []
-        near = {k: share for k, share in self.tracker.overlap.items() if k < before and share > LEAST_OVERLAP}
+        near = {k: share for k, share in self.tracker.overlap.items() if k < before and self._is_expected(k, number)}
         expected = sorted(near, key=lambda k: -near[k])[:1]
         alike = self.index.likeliest(words, self.config.candidates, before, least=STAND_OUT)
         found: list[int] = []
@@ -195,12 +197,18 @@ class LoopCloser:
                 found.append(k)
         return found
 
+    def _is_expected(self, old: int, new: int) -> bool:
+        """Whether two keyframes see the same by the poses that they have."""
+        keyframes = self.tracker.keyframes
+        step, turn = motion_between(keyframes[old].pose, keyframes[new].pose)
+        return bool(self.tracker.overlap.get(old, 0.0) > LEAST_OVERLAP and step < NEAR[0] and turn < NEAR[1])
+
     def _compare(self, old: int, new: int) -> bool:
         """Whether a pair is a loop that says something new."""
         poses = self.tracker.keyframes
         expected = inverse(poses[old].pose) @ poses[new].pose
         verdict = self.verifier.by_features(old, new)
-        if verdict.T_a_b is None and self.tracker.overlap.get(old, 0.0) > LEAST_OVERLAP:
+        if verdict.T_a_b is None and self._is_expected(old, new):
             verdict = Verdict(Gate.PASSED, T_a_b=expected)
         if verdict.T_a_b is not None:
             why = self._why_implausible(old, new, verdict.T_a_b, expected)

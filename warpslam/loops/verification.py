@@ -34,6 +34,8 @@ from warpslam.tracking.features.settings import FeatureSettings
 
 LEAST_INLIERS, LEAST_SHARE = 12, 0.25
 """Of the matches, for a pose to be tried further."""
+INLIER_ERROR, LEAST_ERROR = 0.009, 2.5
+"""Distance of an inlier, as a share of the image's width, and in pixels at least."""
 LEAST_SEEN, MOST_EMPTY = 0.2, 0.06
 """Share of one's depth that the other must have measured as well; share of what both tell of that may be in empty
 space.
@@ -124,7 +126,8 @@ class Verifier:
         if len(i) < LEAST_INLIERS:
             return Verdict(Gate.GEOMETRY, f"{len(i)} matches")
         points, pixels = A.points[known[i]], B.pixels[j]
-        found = ransac_pose(points, pixels, camera, error=6.0, iterations=200, confidence=0.999)
+        error = max(LEAST_ERROR, INLIER_ERROR * camera.width)
+        found = ransac_pose(points, pixels, camera, error=error, iterations=200, confidence=0.999)
         if found is None or found[1] < LEAST_INLIERS or found[1] < LEAST_SHARE * len(i):
             return Verdict(Gate.GEOMETRY, f"{0 if found is None else found[1]} inliers of {len(i)} matches")
         return Verdict(Gate.PASSED, T_a_b=orthonormalized(inverse(found[0])))
@@ -157,7 +160,7 @@ class Verifier:
         tasks = new_tasks(2)
         tasks["grey"], tasks["depth"] = config.grey_weight, config.depth_weight
         tasks["keyframe"], tasks["row"] = points, rows[::-1]
-        tasks["top"], tasks["cost_level"] = registrar.plan.middle, 0
+        tasks["top"], tasks["cost_level"] = min(registrar.plan.middle + 1, registrar.plan.top), 0
         tasks["T"] = inverse(T_a_b), T_a_b
         results = registrar.register(tasks)
         there, back = (np.asarray(result["T"], np.float64) for result in results)
