@@ -64,6 +64,24 @@ def test_a_loop_that_lies_gets_no_weight(circle):
     assert motion_between(both.poses[-1], true[-1])[0] < 0.01
 
 
+def test_parts_that_only_a_lie_joins_stay_apart(circle):
+    """Each keeps its first pose; and a loop that is right moves the one that came later as a whole."""
+    true, drifted, graph = circle
+    offset = motion_of(np.array([5.0, 0.0, 0.0, 0.0, 0.3, 0.0]))
+    for (i, j), edge in list(graph.tracked.items()):
+        graph.track(i + COUNT, j + COUNT, edge.T_i_j, TIGHT)
+    poses = np.concatenate([drifted, offset @ drifted])
+    graph.close(3, COUNT + 3, np.eye(4), TIGHT)
+    joined = graph.solve(poses)
+    np.testing.assert_allclose(joined.poses[COUNT:], drifted, atol=1e-3)
+    graph.close(3, COUNT + 3, np.eye(4), TIGHT)
+    for n in (10, 20):
+        graph.close(n, COUNT + n, inverse(poses[n]) @ poses[COUNT + n], TIGHT)
+    apart = graph.solve(poses)
+    assert apart.weights[3, COUNT + 3] < 1e-3 and apart.weights[10, COUNT + 10] > 0.99
+    np.testing.assert_allclose(apart.poses, poses, atol=1e-2)
+
+
 def test_edges_are_the_same_either_way(circle):
     """T_j_i and the covariance in the axes of i tell what T_i_j and that in the axes of j do."""
     true, drifted, one = circle

@@ -108,16 +108,6 @@ class PoseGraph:
         length = [max(float(np.linalg.norm(edge.T_i_j[:3, 3])), 1e-3) for edge in edges.values()]
         return np.asarray(dijkstra(coo_array((length, (i, j)), (count, count)).tocsr(), directed=False, indices=start))
 
-    def _first_of_each_part(self, count: int, fixed: int) -> list[int]:
-        """First keyframe of each part of the graph that has none of the first ``fixed``."""
-        from scipy.sparse import coo_array
-        from scipy.sparse.csgraph import connected_components
-
-        i, j = np.array(list(self.tracked | self.loops), np.int64).reshape(-1, 2).T
-        _, parts = connected_components(coo_array((np.ones(len(i)), (i, j)), (count, count)), directed=False)
-        _, first = np.unique(parts, return_index=True)
-        return [n for n in first.tolist() if n >= fixed]
-
     def solve(self, poses: Sequence[np.ndarray] | np.ndarray, fixed: int = 0) -> Solution:
         """Poses (N, 4, 4) that fit all edges best, from ``poses`` on; the first ``fixed`` stay where they are, and of
         each part of the graph without any of these the first.
@@ -126,38 +116,51 @@ class PoseGraph:
             ConfigError: GTSAM is not installed.
         """
         gtsam = import_gtsam()
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        values = gtsam.Values()
         for n, pose in enumerate(poses):
             values.insert(n, gtsam.Pose3(np.asarray(pose, np.float64)))
-        held = gtsam.noiseModel.Isotropic.Sigma(6, HELD)
-        for n in sorted({*range(fixed), *self._first_of_each_part(len(poses), fixed)}):
-            graph.add(gtsam.PriorFactorPose3(n, values.atPose3(n), held))
-        for pair, edge in self.tracked.items():
-            graph.add(_factor(gtsam, pair, edge))
-        weights = self._weights(gtsam, graph, values)
-        for pair, edge in self.loops.items():
-            if weights[pair] >= LEAST_WEIGHT:
-                graph.add(_factor(gtsam, pair, edge))
+        weights = self._weights(gtsam, values, fixed)
+        # What is left of a loop that lies would still pull, by metres over millimetres: it is left out.
+        kept = {pair: edge for pair, edge in self.loops.items() if weights[pair] >= LEAST_WEIGHT}
+        graph = self._factors(gtsam, values, fixed, kept)
         found = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
         return Solution(np.array([found.atPose3(n).matrix() for n in range(len(poses))]), weights)
 
-    def _weights(self, gtsam: Any, tracked: Any, values: Any) -> dict[tuple[int, int], float]:
-        """Of each loop. What is left of one that lies would still pull, by metres over millimetres: it is no solution
-        yet.
-        """
+    def _weights(self, gtsam: Any, values: Any, fixed: int) -> dict[tuple[int, int], float]:
+        """Of each loop."""
         if not self.loops:
             return {}
-        graph = gtsam.NonlinearFactorGraph(tracked)
-        for pair, edge in self.loops.items():
-            graph.add(_factor(gtsam, pair, edge))
+        graph = self._factors(gtsam, values, fixed, self.loops)
+        believed = graph.size() - len(self.loops)
         params = gtsam.GncLMParams()
-        params.setKnownInliers(list(range(tracked.size())))
+        params.setKnownInliers(list(range(believed)))
         params.setLossType(gtsam.GncLossType.TLS)
         optimizer = gtsam.GncLMOptimizer(graph, values, params)
         optimizer.setInlierCostThresholdsAtProbability(CONFIDENCE)
         optimizer.optimize()
-        found = np.asarray(optimizer.getWeights())[tracked.size() :]
-        return dict(zip(self.loops, found.tolist(), strict=True))
+        return dict(zip(self.loops, np.asarray(optimizer.getWeights())[believed:].tolist(), strict=True))
+
+    def _factors(self, gtsam: Any, values: Any, fixed: int, loops: Mapping[tuple[int, int], Edge]) -> Any:
+        """A graph of what is held, of what tracking says, and of some loops, in this order."""
+        graph, held = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Isotropic.Sigma(6, HELD)
+        for n in [*range(fixed), *self._first_of_each_part(values.size(), fixed, loops)]:
+            graph.add(gtsam.PriorFactorPose3(n, values.atPose3(n), held))
+        for edges in (self.tracked, loops):
+            for pair, edge in edges.items():
+                # Covariances are of a twist (w, v) there.
+                noise = gtsam.noiseModel.Gaussian.Covariance(edge.covariance[np.ix_(_GTSAM_ORDER, _GTSAM_ORDER)])
+                graph.add(gtsam.BetweenFactorPose3(*pair, gtsam.Pose3(edge.T_i_j), noise))
+        return graph
+
+    def _first_of_each_part(self, count: int, fixed: int, loops: Mapping[tuple[int, int], Edge]) -> list[int]:
+        """First keyframe of each part of the graph that has none of the first ``fixed``."""
+        from scipy.sparse import coo_array
+        from scipy.sparse.csgraph import connected_components
+
+        i, j = np.array([*self.tracked, *loops], np.int64).reshape(-1, 2).T
+        _, parts = connected_components(coo_array((np.ones(len(i)), (i, j)), (count, count)), directed=False)
+        _, first = np.unique(parts, return_index=True)
+        return sorted(n for n in first.tolist() if n >= fixed)
 
 
 def import_gtsam() -> Any:
@@ -192,10 +195,3 @@ def edges_from_arrays(
         (i, j): Edge(T.copy(), covariance.copy())
         for (i, j), T, covariance in zip(pairs.tolist(), transforms, covariances, strict=True)
     }
-
-
-def _factor(gtsam: Any, pair: tuple[int, int], edge: Edge) -> Any:
-    """An edge, whose covariance is of a twist (w, v) there."""
-    covariance = edge.covariance[np.ix_(_GTSAM_ORDER, _GTSAM_ORDER)]
-    noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-    return gtsam.BetweenFactorPose3(*pair, gtsam.Pose3(edge.T_i_j), noise)
