@@ -29,7 +29,7 @@ from warpslam.tracking.direct.second import Picture
 from warpslam.tracking.direct.tracker import MAX_SIGMA, SAME_STEP, SCRATCH, TELLING, DirectTracker, covariance_of
 from warpslam.tracking.direct.window import Pose, refine_window
 from warpslam.tracking.features.detection import DEPTH_STRIDE, FeatureFrame, detect
-from warpslam.tracking.features.pairs import descriptor_pairs, ransac_pose
+from warpslam.tracking.features.pairs import descriptor_pairs
 from warpslam.tracking.features.settings import FeatureSettings
 
 LEAST_INLIERS, LEAST_SHARE = 12, 0.25
@@ -40,6 +40,8 @@ LEAST_SEEN, MOST_EMPTY = 0.2, 0.06
 """Share of one's depth that the other must have measured as well; share of what both tell of that may be in empty
 space.
 """
+DRAWS, REFITS = 300, 3
+"""Triples that are tried; fits to all inliers after that."""
 TOLERANCE = 0.02, 4.0
 """Depths agree within this [m], and so many standard deviations more."""
 LEAST_AGREEMENT, LEAST_CORRELATION, LEAST_VIEW = 0.75, 0.65, 0.2
@@ -120,17 +122,16 @@ class Verifier:
 
     def by_features(self, a: int, b: int) -> Verdict:
         """First gate: where b is by features that both have."""
-        A, B, camera = self.features.of(a), self.features.of(b), self.tracker.camera
-        known = np.flatnonzero(A.depth > 0)
-        i, j = descriptor_pairs(A.descriptors[known], B.descriptors)
-        if len(i) < LEAST_INLIERS:
-            return Verdict(Gate.GEOMETRY, f"{len(i)} matches")
-        points, pixels = A.points[known[i]], B.pixels[j]
-        error = max(LEAST_ERROR, INLIER_ERROR * camera.width)
-        found = ransac_pose(points, pixels, camera, error=error, iterations=200, confidence=0.999)
-        if found is None or found[1] < LEAST_INLIERS or found[1] < LEAST_SHARE * len(i):
-            return Verdict(Gate.GEOMETRY, f"{0 if found is None else found[1]} inliers of {len(i)} matches")
-        return Verdict(Gate.PASSED, T_a_b=orthonormalized(inverse(found[0])))
+        A, B = self.features.of(a), self.features.of(b)
+        i, j = descriptor_pairs(A.descriptors, B.descriptors)
+        both = (A.depth[i] > 0) & (B.depth[j] > 0)
+        points, seen = A.points[i[both]].astype(np.float64), B.points[j[both]].astype(np.float64)
+        if len(points) < LEAST_INLIERS:
+            return Verdict(Gate.GEOMETRY, f"{len(points)} matches")
+        T_b_a, inliers = rigid_motion(points, seen, self.tracker.camera)
+        if inliers < LEAST_INLIERS or inliers < LEAST_SHARE * len(points):
+            return Verdict(Gate.GEOMETRY, f"{inliers} inliers of {len(points)} matches")
+        return Verdict(Gate.PASSED, T_a_b=inverse(T_b_a))
 
     def by_images(self, a: int, b: int, T_a_b: np.ndarray) -> Verdict:
         """The other gates, from where b is about."""
@@ -203,6 +204,53 @@ class Verifier:
             best = max(one.correlation for one in each)
             found.append(Measures(each[-1].view, each[-1].known, each[-1].agreement, best))
         return found
+
+
+def rigid_motion(points: np.ndarray, seen: np.ndarray, camera: Intrinsics) -> tuple[np.ndarray, int]:
+    """The motion that takes most points to where they are seen, in the image and in depth: fits to three pairs each
+    (Kabsch), whose draws are always the same, and to all inliers of the best.
+
+    Args:
+        points: In the axes of one camera [m], (n, 3), n >= 3.
+        seen: The same in those of another, (n, 3).
+        camera: Both.
+
+    Returns:
+        T_seen_points (4, 4), and its inliers.
+    """
+    drawn = np.random.default_rng(0).random((DRAWS, len(points))).argpartition(2, axis=1)[:, :3]
+    motions = _fitted(points[drawn], seen[drawn])
+    inside = _agree(motions, points, seen, camera)
+    best = int(inside.sum(axis=1).argmax())
+    T, good = motions[best], inside[best]
+    for _ in range(REFITS):
+        if good.sum() < 3:
+            break
+        T = _fitted(points[None, good], seen[None, good])[0]
+        good = _agree(T[None], points, seen, camera)[0]
+    return orthonormalized(T), int(good.sum())
+
+
+def _fitted(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Rigid motions (m, 4, 4) that take points a to b best, (m, k, 3)."""
+    a0, b0 = a.mean(axis=1, keepdims=True), b.mean(axis=1, keepdims=True)
+    U, _, Vt = np.linalg.svd(np.swapaxes(b - b0, 1, 2) @ (a - a0))
+    U[:, :, 2] *= np.sign(np.linalg.det(U @ Vt))[:, None]
+    T = np.tile(np.eye(4), (len(a), 1, 1))
+    T[:, :3, :3] = U @ Vt
+    T[:, :3, 3] = b0[:, 0] - np.einsum("mij,mj->mi", T[:, :3, :3], a0[:, 0])
+    return T
+
+
+def _agree(T: np.ndarray, points: np.ndarray, seen: np.ndarray, camera: Intrinsics) -> np.ndarray:
+    """Which points come to where they are seen by each motion, bool (m, n)."""
+    moved = np.einsum("mij,nj->mni", T[:, :3, :3], points) + T[:, None, :3, 3]
+    z = np.maximum(moved[..., 2], 0.05)
+    expected = camera.project(seen[:, 0], seen[:, 1], seen[:, 2])
+    found = camera.project(moved[..., 0], moved[..., 1], z)
+    pixels = np.hypot(found[0] - expected[0], found[1] - expected[1])
+    close = np.abs(moved[..., 2] - seen[:, 2]) < 2.0 * TOLERANCE[0] + TOLERANCE[1] * _sigma(seen[:, 2])
+    return np.asarray(close & (pixels < max(LEAST_ERROR, INLIER_ERROR * camera.width)))
 
 
 def depth_consistency(
