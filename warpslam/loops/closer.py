@@ -211,10 +211,10 @@ class LoopCloser:
         if verdict.T_a_b is None and self._is_expected(old, new):
             verdict = Verdict(Gate.PASSED, T_a_b=expected)
         if verdict.T_a_b is not None:
-            why = self._why_implausible(old, new, verdict.T_a_b, expected)
             verdict = self.verifier.by_images(old, new, verdict.T_a_b)
-            if verdict.gate is Gate.PASSED and why:
-                verdict = Verdict(Gate.PLAUSIBLE, why)
+        if verdict.gate is Gate.PASSED and verdict.T_a_b is not None:
+            why = self._why_implausible(old, new, verdict.T_a_b, expected)
+            verdict = Verdict(Gate.PLAUSIBLE, why, verdict.T_a_b) if why else verdict
         self.figures.count(verdict)
         frames = poses[old].index, poses[new].index
         self.log.append({"frames": frames, "gate": str(verdict.gate), "why": verdict.why, "T": verdict.T_a_b})
