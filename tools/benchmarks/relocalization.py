@@ -2,10 +2,11 @@
 
     python -m tools.benchmarks.relocalization HOUSE/walk --blackouts 50 --kidnappings 50 --set loops.enabled=true
 
-The map is made of every second frame; what the camera sees later are the frames between. A blackout covers the lens for
-100 black frames while the camera moves on along its path; a kidnapping is the next frame from anywhere else. A trial
-is right if a frame of the first `WITHIN` is OK and no frame that is OK is off by more than `OFF`, wrong if one is, and
-lost otherwise. Trials follow each other in one session, so what a wrong pose adds to the map stays.
+The map is made of all frames; what the camera sees later are its frames with new noise of `NOISE` grey values, so that
+no image is that of a keyframe. Frames that were lost when the map was made are no known places. A blackout covers the
+lens for 100 black frames while the camera moves on along its path; a kidnapping is the next frame from anywhere else.
+A trial is right if a frame of the first `WITHIN` is OK and no frame that is OK is off by more than `OFF`, wrong if one
+is, and lost otherwise. Trials follow each other in one session, so what a wrong pose adds to the map stays.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ OFF = 0.5
 """[m]"""
 COVERED = 100
 """Black frames of a blackout."""
+NOISE = 2.0
+"""Standard deviation."""
 APART = 1.0
 """A kidnapped camera is at least so far away [m]."""
 
@@ -56,9 +59,9 @@ class Trial:
 
 
 def make_map(sequence: RgbdSequence, config: Config, device: str) -> Slam:
-    """Track through every second frame."""
+    """Track through all frames."""
     slam = Slam(sequence.intrinsics, config, device, timing=sequence.timing)
-    for index in range(0, len(sequence), 2):
+    for index in range(len(sequence)):
         frame = sequence[index]
         pose = frame.T_world_camera if index == 0 else None
         slam.step(frame.rgb, frame.depth, frame.timestamp, pose, depth_timestamp=frame.depth_timestamp)
@@ -66,7 +69,7 @@ def make_map(sequence: RgbdSequence, config: Config, device: str) -> Slam:
 
 
 def attempt(slam: Slam, sequence: RgbdSequence, truth: np.ndarray, kind: str, first: int) -> Trial:
-    """The camera sees frames from ``first`` on, every second one."""
+    """The camera sees frames from ``first`` on."""
     start, time_ = time.perf_counter(), slam.history.last_timestamp
     camera = sequence.intrinsics
     black = np.zeros((camera.height, camera.width, 3), np.uint8)
@@ -75,10 +78,11 @@ def attempt(slam: Slam, sequence: RgbdSequence, truth: np.ndarray, kind: str, fi
         slam.step(black, np.ones((camera.height, camera.width), np.float32), time_)
     after, off = None, 0.0
     for count in range(WITHIN):
-        index = first + 2 * count
-        frame = sequence[index]
+        index = first + count
+        frame, rng = sequence[index], np.random.default_rng([index, len(slam.history)])
+        rgb = np.clip(np.rint(frame.rgb + rng.normal(0.0, NOISE, frame.rgb.shape)), 0, 255).astype(np.uint8)
         time_ += 1 / 30
-        result = slam.step(frame.rgb, frame.depth, time_)
+        result = slam.step(rgb, frame.depth, time_)
         if result.status is FrameStatus.OK:
             after = count + 1 if after is None else after
             off = max(off, float(np.linalg.norm(result.T_world_camera[:3, 3] - truth[index][:3, 3])))
@@ -92,18 +96,19 @@ def trials(
     """All of them, in a row that a seed decides."""
     rng = np.random.default_rng(seed)
     kinds = rng.permutation(["blackout"] * blackouts + ["kidnapping"] * kidnappings).tolist()
-    last, here = len(sequence) - 2 * WITHIN - 1, 1
+    last, here = len(sequence) - WITHIN, 0
+    known = np.array([status is FrameStatus.OK for status in slam.trajectory.status[: len(sequence)]])
     found = []
     for kind in kinds:
         far = np.linalg.norm(truth[:, :3, 3] - truth[here][:3, 3], axis=1) > APART
-        anywhere = [n for n in range(1, last, 2) if far[n]]
-        ahead = [n for n in anywhere if 0 < n - here <= 2 * COVERED] or anywhere
+        anywhere = [n for n in range(last) if far[n] and known[n : n + WITHIN].all()]
+        ahead = [n for n in anywhere if 0 < n - here <= COVERED] or anywhere
         choice = ahead if kind == "blackout" else anywhere
         if not choice:
             raise InputError("the path is too short to carry the camera elsewhere")
         first = int(rng.choice(choice))
         found.append(attempt(slam, sequence, truth, kind, first))
-        here = first + 2 * (WITHIN - 1)
+        here = first + WITHIN - 1
         print(found[-1], file=sys.stderr, flush=True)
     return found
 
@@ -127,6 +132,8 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"{options.sequence} has no true poses to compare with")
     config = Config.from_preset(sequence.preset, ["mapping.enabled=false", *options.overrides])
     slam = make_map(sequence, config, options.device)
+    lost = sum(status is not FrameStatus.OK for status in slam.trajectory.status)
+    print(f"map of {len(sequence)} frames, {len(slam.keyframes)} keyframes, {lost} frames lost", file=sys.stderr)
     slam = Slam.from_state(slam.state(), options.device, localize_only=True)
     slam.forget_pose()
     found = trials(slam, sequence, truth, options.blackouts, options.kidnappings, options.seed)

@@ -231,7 +231,7 @@ class LoopConfig(_Group):
     """Loops, with direct tracking: known places are recognised, and a pose graph mends what was drifted."""
 
     enabled: bool = Field(False, description="look for loops at each keyframe; needs the package gtsam")
-    candidates: int = Field(2, ge=0, le=20, description="old keyframes that a new one is compared with by its words")
+    candidates: int = Field(1, ge=0, le=20, description="old keyframes that a new one is compared with by its words")
     places: int = Field(4, ge=0, le=20, description="keyframes that a lost camera is looked for at by its words")
     drift: float = Field(
         0.05,
