@@ -22,7 +22,7 @@ from warpslam.field.decoders import Decoders
 from warpslam.field.rendering import RenderedImage, render_image
 from warpslam.frames import AdmittedFrame, FrameResult, FrameStatus, admit, check_settings, skipped
 from warpslam.mapping.frustum import measured_extent
-from warpslam.mapping.mapper import Mapper
+from warpslam.mapping.policy import new_mapper
 from warpslam.mapping.scheduler import MappingTask, new_scheduler
 from warpslam.meshing import extract_mesh
 from warpslam.poses import check_transform
@@ -94,7 +94,7 @@ class Slam:
         self.images = ImagePool(intrinsics, self.device, self.config.keyframes.max_gigabytes)
         self.tracker = Tracker(intrinsics, self.config.tracking, self.config.sampling, self.device, seed)
         self.localizer = Localizer(self.tracker, self.config.tracking, intrinsics)
-        self.mapper = Mapper(self.scene, intrinsics, self.config.mapping, self.config.sampling, self.device, seed)
+        self.mapper = new_mapper(self.scene, intrinsics, self.config, self.device, seed)
         self.direct = self._direct_tracker()
         self.scheduler = new_scheduler(self.config.schedule, self.mapper, self.images)
         self._seen: list[SeenDepth] = []
@@ -505,6 +505,7 @@ class Slam:
             mapped=self._mapped,
             direct=None if self.direct is None else self.direct.state(),
             digest=self._digest,
+            optimizer=self.mapper.state(),
         )
 
     @classmethod
@@ -521,6 +522,7 @@ class Slam:
         slam = cls(state.intrinsics, config, device, state.seed, decoders=state.scene.decoders, timing=state.timing)
         slam.history = FrameHistory.restored(state.history)
         slam.scene.restore(state.scene)
+        slam.mapper.restore(state.optimizer)
         images = [image for _, image in state.keyframes]
         slam.images.restore(state.current_image, state.current_motion, images)
         slam.keyframes = [

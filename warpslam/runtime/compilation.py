@@ -28,11 +28,13 @@ _STAGES = (
     "kernels.losses",
     "kernels.grid",
     "views",
+    "supervision",
     "direct",
     "features",
 )
 _PYTHON_MODULES = {
     "warpslam.rays": ("pixels", "rays", "rejection", "samples"),
+    "warpslam.supervision": ("supervision", "touched_rows"),
     "warpslam.views": ("frustum", "images", "rectify", "seen", "visibility"),
     "warpslam.direct": ("direct.images", "direct.points", "direct.registration"),
     "warpslam.features": ("features.matching", "features.pose", "features.agreement"),

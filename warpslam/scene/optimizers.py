@@ -69,10 +69,12 @@ class GridOptimizer(RowOptimizer):
         """``selected``: bool (rows,), from frustum selection."""
         self.start(grid.row_count, np.flatnonzero(selected))
         self.selected = wp.array(selected.astype(np.uint8), dtype=wp.uint8, device=self.device)
+        place = np.where(selected, np.arange(grid.row_count), -1)
+        self._place = wp.array(place.astype(np.int32), dtype=int, device=self.device)
 
     def wanted(self) -> GridGradient:
         """Where the kernels put this level's gradient, and for which rows."""
-        return GridGradient(self.gradient, self.selected)
+        return GridGradient(self.gradient, self._place)
 
 
 class ColorDecoderOptimizer(RowOptimizer):
