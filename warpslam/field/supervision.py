@@ -54,13 +54,6 @@ def place_band(
     batch.launcher.slices(batch.count, steps, whole=batch.kernels.by_sample)
 
 
-def place_at_surface(batch: RayBatch) -> None:
-    """One sample a ray, where its pixel measures; rays without depth are left out."""
-    batch.sample_count = 1
-    inputs = [batch.measured_depth, batch.keep, batch.z]
-    batch.launcher.launch(supervision.point_at_surface, batch.count, inputs)
-
-
 def query_geometry(batch: RayBatch, arrays: FieldArrays) -> None:
     """Logit of every sample of the kept rays (Eq. 1-3)."""
 

@@ -269,6 +269,25 @@ def surface_depth(
 
 
 @wp.kernel(enable_backward=False)
+def crossing_depth(rays: Rays, keep: wp.array[int], rendered: Rendered, depth: wp.array[float], z: wp.array[float]):
+    """Depth at which the logit first rises through zero, between two samples on a line; where it never does, ``depth``.
+    One a ray.
+    """
+    tid = wp.tid()
+    crossing = depth[tid]
+    if keep[tid] != 0:
+        found = int(0)
+        for n in range(1, rays.sample_count):
+            i = tid * rays.sample_count + n
+            before = rendered.logit[i - 1]
+            behind = rendered.logit[i]
+            if found == 0 and before < 0.0 and behind >= 0.0 and behind != OUTSIDE_LOGIT:
+                found = 1
+                crossing = rays.z[i - 1] + (rays.z[i] - rays.z[i - 1]) * before / (before - behind)
+    z[tid] = crossing
+
+
+@wp.kernel(enable_backward=False)
 def composite_backward(
     listed: Listed,
     rays: Rays,

@@ -218,7 +218,7 @@ def direct_loss_backward(
 @wp.kernel(module=MODULE)
 def probe_errors(
     first_current: int,
-    slope: float,
+    target: Target,
     largest: float,
     young_error: float,
     young_updates: float,
@@ -229,11 +229,12 @@ def probe_errors(
     logit: wp.array[float],
     cumulative_error: wp.array2d[float],
 ):
-    """Running sums of the errors of cells for each frame of a window, one probed point a cell.
+    """Running sums of the errors of cells for each frame of a window, one probed ray a cell.
 
-    A point errs by |l| / slope, at most ``largest`` [m], and ``young_error`` more if one of the vertices of its cell
-    was never updated, falling to none at ``young_updates``. The probe is that of the current frame, which the window
-    repeats from ``first_current`` on; of the frames before it nothing is known, and all cells are alike.
+    A ray has two samples, one in free space and one where it measures. It errs by |e| / slope of each, at most
+    ``largest`` [m], and by ``young_error`` more if one of the vertices around the second was never updated, falling to
+    none at ``young_updates``. The probe is that of the current frame, which the window repeats from ``first_current``
+    on; of the frames before it nothing is known, and all cells are alike.
     """
     f = wp.tid()
     total = float(0.0)
@@ -244,9 +245,12 @@ def probe_errors(
             # Where nothing errs, all cells are alike.
             total += 1.0e-6
             if keep[cell] != 0:
-                total += wp.min(wp.abs(logit[cell]) / slope, largest)
+                i = 2 * cell
+                free = sample_error(logit[i], rays.z[i] - rays.z[i + 1], target)[0]
+                total += wp.min(wp.abs(free) / target.slope, largest)
+                total += wp.min(wp.abs(logit[i + 1]) / target.slope, largest)
                 least = float(young_updates)
-                corner = find_cell(lattice, sample_point(cell, rays)).corner
+                corner = find_cell(lattice, sample_point(i + 1, rays)).corner
                 for di in range(2):
                     for dj in range(2):
                         for dk in range(2):
@@ -255,11 +259,3 @@ def probe_errors(
                 total += young_error * (1.0 - least / young_updates)
         cumulative_error[f, cell] = total
 
-
-@wp.kernel(module=MODULE)
-def point_at_surface(measured_depth: wp.array[float], keep: wp.array[int], z: wp.array[float]):
-    """One sample a ray, where it measures; rays without a depth are not kept."""
-    tid = wp.tid()
-    z[tid] = measured_depth[tid]
-    if measured_depth[tid] <= 0.0:
-        keep[tid] = 0

@@ -29,6 +29,7 @@ from warpslam.poses import vector_from_pose
 from warpslam.runtime.launching import Launcher
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
+from warpslam.scene.optimizers import ColorDecoderOptimizer
 from warpslam.scene.scene_map import SceneMap
 from warpslam.scene.touched_rows import TouchedRows, TouchedRowsState
 
@@ -87,7 +88,9 @@ class DirectMapper:
         self._rows = {
             level: TouchedRows(self._launcher, scene.grids[level], capacity) for level in ("middle", "fine", "color")
         }
-        self._probe = Probe(PARTS, PROBED_SHARE, settings, device, self._launcher)
+        self._decoder = ColorDecoderOptimizer(self._launcher)
+        self._decoder.begin()
+        self._probe = Probe(PARTS, PROBED_SHARE, settings, self._target, self._band, device, self._launcher)
         self._window = wp.zeros(PARTS, dtype=int, device=device)
         self._poses = wp.zeros((PARTS, 7), dtype=float, device=device)
 
@@ -189,7 +192,11 @@ class DirectMapper:
     def _iterate(self, images: ImagePool, current: int, pose: np.ndarray) -> None:
         """One iteration; nothing in it may depend on its number or the frame, because it is replayed."""
         batch, arrays, launcher = self._batch, self.scene.arrays(), self._launcher
-        gradients = Gradients(grids={level: self._rows[level].wanted() for level in self._rates})
+        train_decoder = self.config.train_color_decoder
+        gradients = Gradients(
+            grids={level: self._rows[level].wanted() for level in self._rates},
+            color_weights=self._decoder.gradient if train_decoder else None,
+        )
         with launcher.tape() as tape:
             batch.draw(images.arrays, self._window, self._rays_per_part, self.camera, active=self._probe.active)
             batch.cast(self._poses, differentiate=False)
@@ -201,6 +208,8 @@ class DirectMapper:
         launcher.call(partial(tape.backward, batch.loss))
         for level, rate in self._rates.items():
             self._rows[level].update(self.scene.grids[level].features, rate)
+        if train_decoder:
+            self._decoder.update_decoder(self.scene.decoders["color"], self.supervision.decoder_rate)
         batch.next_iteration()
 
     def _outcome(self, frame: int, pose: np.ndarray, window: list[Keyframe]) -> MappingResult:

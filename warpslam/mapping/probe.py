@@ -1,7 +1,8 @@
 """Where the current frame's rays should go under the direct loss: to what the map has wrong, and to what it hardly knows.
 
-One point a cell of the image, at its measured depth: there the logit should be 0. Space that few rays have seen is known
-by its vertices, whose updates are counted.
+One ray a cell of the image, with a sample at its measured depth, where the logit should be 0, and one before it, at the
+depth of a pixel nearby where that is smaller: beside an outline free space is most likely to be taken for occupied.
+Space that few rays have seen is known by its vertices, whose updates are counted.
 """
 
 from __future__ import annotations
@@ -11,10 +12,11 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.config import SupervisionConfig
-from warpslam.field.arrays import FieldArrays, camera_struct
+from warpslam.field.arrays import FieldArrays, camera_struct, struct
 from warpslam.field.ray_batch import RayBatch, image_struct
-from warpslam.field.supervision import place_at_surface, query_geometry
+from warpslam.field.supervision import place_band, query_geometry
 from warpslam.kernels import pixels, supervision
+from warpslam.kernels.supervision import Band, Target
 from warpslam.poses import vector_from_pose
 from warpslam.runtime.launching import Launcher
 from warpslam.runtime.phases import phase
@@ -33,11 +35,28 @@ class Probe:
     """
 
     def __init__(
-        self, frame_count: int, share: float, settings: SupervisionConfig, device: wp.Device, launcher: Launcher
+        self,
+        frame_count: int,
+        share: float,
+        settings: SupervisionConfig,
+        target: Target,
+        band: Band,
+        device: wp.Device,
+        launcher: Launcher,
     ) -> None:
-        self.settings, self._launcher = settings, launcher
+        self.settings, self._target, self._launcher = settings, target, launcher
+        self._band = struct(
+            Band,
+            free=1,
+            edge=1,
+            front=band.front,
+            behind=band.behind,
+            radius=band.radius,
+            edge_front=band.edge_front,
+            edge_behind=band.edge_behind,
+        )
         count = CELLS[0] * CELLS[1]
-        self._batch = RayBatch(count, 1, device, launcher)
+        self._batch = RayBatch(count, 2, device, launcher)
         self._batch.count = count
         self._window = wp.zeros(1, dtype=int, device=device)  # slot 0 of the pool
         self._pose = wp.zeros((1, 7), dtype=float, device=device)
@@ -73,8 +92,8 @@ class Probe:
         launch(pixels.probe_pixels, batch.count, [*inputs, batch.pixels])
         batch.cast(self._pose, differentiate=False)
         batch.bound(arrays)
-        place_at_surface(batch)
+        place_band(batch, self._band, images, self._window, camera)
         query_geometry(batch, arrays)
-        inputs = [first_current, self.settings.slope, LARGEST_ERROR, YOUNG_ERROR, float(self.settings.young_updates)]
+        inputs = [first_current, self._target, LARGEST_ERROR, YOUNG_ERROR, float(self.settings.young_updates)]
         inputs += [arrays.lattices["fine"], updates, batch.rays, batch.keep, batch.logit, self._cumulative]
         launch(supervision.probe_errors, self._cumulative.shape[0], inputs)
