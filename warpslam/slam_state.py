@@ -16,6 +16,7 @@ from warpslam.config import Config
 from warpslam.errors import ConfigError, InputError
 from warpslam.field.decoders import LEVELS, Decoders, DecoderWeights, expected_shapes
 from warpslam.frames import check_settings
+from warpslam.kernels.decoder.layout import COLOR_WEIGHT_ROWS
 from warpslam.runtime.cores import slice_count
 from warpslam.scene.feature_grid import GridState
 from warpslam.scene.image_pool import CompactImage
@@ -234,12 +235,13 @@ def _grid(fields: StateFields, level: str) -> GridState:
 
 def _optimizer(fields: StateFields) -> dict[str, TouchedRowsState]:
     levels = fields.header.get("optimizer")
-    if not isinstance(levels, list) or not set(levels) <= set(LEVELS):
+    if not isinstance(levels, list) or not set(levels) <= {*LEVELS, "decoder"}:
         raise fields.damaged("optimizer", f"{levels!r} are no levels")
     result = {}
     for level in levels:
-        total = int(np.prod(fields.array(f"grid_{level}_shape", np.int64, (3,))))
-        rows = fields.array(f"optimizer_{level}_rows", np.int32, (None,))
+        is_grid = level != "decoder"
+        total = int(np.prod(fields.array(f"grid_{level}_shape", np.int64, (3,)))) if is_grid else COLOR_WEIGHT_ROWS
+        rows = fields.array(f"optimizer_{level}_rows", np.int32, (None if is_grid else total,))
         if len(rows) and (rows[0] < 0 or rows[-1] >= total or (np.diff(rows) <= 0).any()):
             raise fields.damaged(f"optimizer_{level}_rows", f"not ascending rows below {total}")
         result[level] = TouchedRowsState(

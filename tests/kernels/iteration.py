@@ -148,9 +148,7 @@ class Iteration:
 
     def _wanted(self, levels, *, points: bool) -> Gradients:
         grids = {
-            level: GridGradient(
-                gradient_buffers(self.arrays.features[level].shape[0], self.device), self.places[level]
-            )
+            level: GridGradient(gradient_buffers(self.arrays.features[level].shape[0], self.device), self.places[level])
             for level in levels
         }
         weights = gradient_buffers(COLOR_WEIGHT_ROWS, self.device) if self.stage == "color" else None

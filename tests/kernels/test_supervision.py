@@ -13,10 +13,10 @@ from tests.kernels.test_against_oracle import check_rows
 from tests.kernels.test_finite_differences import check
 from tests.reference import oracle
 from warpslam.camera import Intrinsics
-from warpslam.field.arrays import GridGradient, Gradients, gradient_buffers, struct
+from warpslam.field.arrays import Gradients, GridGradient, gradient_buffers, struct
+from warpslam.field.packing import PackedDecoder
 from warpslam.field.ray_batch import RayBatch
 from warpslam.field.supervision import place_band, supervise
-from warpslam.field.packing import PackedDecoder
 from warpslam.kernels.decoder.layout import COLOR_WEIGHT_ROWS
 from warpslam.kernels.grid import Vec32
 from warpslam.kernels.supervision import Band, Target

@@ -151,8 +151,8 @@ class MappingConfig(_Group):
     color_weight: float = Field(0.2, ge=0, description="lambda_p of Eq. 10")
     loss: Literal["direct", "rendering"] = Field(
         "rendering",
-        description="direct: every sample against the measured depth (group supervision); rendering: depth and colour of "
-        "whole rays (paper)",
+        description="direct: every sample against the measured depth (group supervision); rendering: depth and colour "
+        "of whole rays (paper)",
     )
     loss_reduction: Literal["sum", "mean"] = Field(
         "sum", description="of the rendering loss: sums over rays (released code) or means (Eq. 8-9)"

@@ -64,8 +64,8 @@ class FieldArrays:
 
 @dataclass
 class GridGradient:
-    """Gradient of one level: ``buffers`` (slices, places) of `Vec32`, and the ``place`` of each row in them, int (rows,),
-    -1 for rows that get none.
+    """Gradient of one level: ``buffers`` (slices, places) of `Vec32`, and the ``place`` of each row in them, int
+    (rows,), -1 for rows that get none.
 
     touched: Where the rows that get a gradient are listed in the adjoint, which gives them their places; None = places
         are given.

@@ -157,7 +157,15 @@ def _scatter(
 
 def begin_rays(batch: RayBatch, first: int, stop: int, slot: int) -> Step:
     """Empty the slice's list of samples that need colour, and mark the rays that are kept."""
-    inputs = [first, color_list(batch, first, slot), batch.keep, batch.transmittance, batch.depth, batch.variance, batch.rgb]
+    inputs = [
+        first,
+        color_list(batch, first, slot),
+        batch.keep,
+        batch.transmittance,
+        batch.depth,
+        batch.variance,
+        batch.rgb,
+    ]
     return (compositing.start_rays, stop - first, inputs)
 
 

@@ -22,13 +22,13 @@ import warp as wp
 from warpslam.camera import Intrinsics
 from warpslam.field.arrays import EXACT, FieldArrays, Gradients, camera_struct
 from warpslam.field.passes import (
+    begin_rays,
     collect_rays,
     color_adjoint,
     color_forward,
     color_list,
     geometry_adjoint,
     logits,
-    begin_rays,
     steep_list,
     steep_samples,
 )
@@ -44,7 +44,7 @@ GEOMETRY = ("middle", "fine")
 def place_band(
     batch: RayBatch, band: Band, images: tuple[wp.array, wp.array, wp.array], window: wp.array, camera: Intrinsics
 ) -> None:
-    """Samples of the rays that `RayBatch.draw` drew from the ``window`` of ``images``; rays without depth are left out."""
+    """Samples of rays that `RayBatch.draw` drew from the ``window`` of ``images``; those without depth are left out."""
     batch.sample_count = band.free + band.near + 1
     inputs = [batch.draws, band, camera_struct(camera), window, image_struct(images), batch.pixels, batch.keep, batch.z]
 
@@ -58,13 +58,22 @@ def query_geometry(batch: RayBatch, arrays: FieldArrays) -> None:
     """Logit of every sample of the kept rays (Eq. 1-3)."""
 
     def steps(first: int, stop: int, slot: int) -> list[Step]:
-        return [begin_rays(batch, first, stop, slot), *logits(batch, arrays, "fine", first, stop, 0, batch.sample_count, EXACT)]
+        return [
+            begin_rays(batch, first, stop, slot),
+            *logits(batch, arrays, "fine", first, stop, 0, batch.sample_count, EXACT),
+        ]
 
     batch.launcher.slices(batch.count, steps, whole=batch.kernels.by_sample)
 
 
 def supervise(
-    batch: RayBatch, arrays: FieldArrays, target: Target, gradients: Gradients, tape: wp.Tape, *, with_color: bool = True
+    batch: RayBatch,
+    arrays: FieldArrays,
+    target: Target,
+    gradients: Gradients,
+    tape: wp.Tape,
+    *,
+    with_color: bool = True,
 ) -> None:
     """The direct loss into `RayBatch.loss`, its adjoint onto the tape.
 
@@ -121,7 +130,9 @@ def _adjoint(
     # A level a thread: each lists its rows alone, and so in the same order every time.
     listing = [level for level in ("fine", "middle", "color") if _lists(gradients, level)]
     if listing:
-        parts.append(commands(len(listing), lambda first, stop, _: _touch(batch, arrays, gradients, listing[first:stop])))
+        parts.append(
+            commands(len(listing), lambda first, stop, _: _touch(batch, arrays, gradients, listing[first:stop]))
+        )
     parts.append(commands(batch.count, to_rows, whole=whole))
     return partial(_run_each, parts)
 

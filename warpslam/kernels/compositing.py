@@ -271,8 +271,8 @@ def surface_depth(
 
 @wp.kernel(enable_backward=False)
 def crossing_depth(rays: Rays, keep: wp.array[int], rendered: Rendered, depth: wp.array[float], z: wp.array[float]):
-    """Depth at which the logit first rises through zero and on to `SOLID_LOGIT`, between two samples on a line; where it
-    never does, ``depth``. One a ray. Less than solid is what an outline leaves beside it.
+    """Depth at which the logit first rises through zero and on to `SOLID_LOGIT`, between two samples on a line; where
+    it never does, ``depth``. One a ray. Less than solid is what an outline leaves beside it.
     """
     tid = wp.tid()
     crossing = depth[tid]

@@ -153,7 +153,7 @@ def interpolate_adjoint_features(
     cell: Cell,
     dc: Vec32,
 ):
-    """Add the gradient to those of the 8 rows that have a place >= 0, in gradient buffer ``slot`` (one a CPU thread)."""
+    """Add the gradient to those of the 8 rows that have a place, in gradient buffer ``slot`` (one a CPU thread)."""
     i = cell.corner[0]
     j = cell.corner[1]
     k = cell.corner[2]

@@ -258,4 +258,3 @@ def probe_errors(
                             least = wp.min(least, float(updates[row]))
                 total += young_error * (1.0 - least / young_updates)
         cumulative_error[f, cell] = total
-

@@ -137,8 +137,8 @@ class DirectMapper:
         return {level: self._rows[level].changed_rows() for level in self._rates}
 
     def state(self) -> dict[str, TouchedRowsState]:
-        """What the next call depends on beside the map, by level."""
-        return {level: rows.state() for level, rows in self._rows.items()}
+        """What the next call depends on beside the map: by level, and of the colour decoder as ``decoder``."""
+        return {**{level: rows.state() for level, rows in self._rows.items()}, "decoder": self._decoder.state()}
 
     def restore(self, state: dict[str, TouchedRowsState]) -> None:
         """Put back what `state` was; the map is already what it was."""
@@ -146,6 +146,8 @@ class DirectMapper:
         for level, rows in self._rows.items():
             if level in state:
                 rows.restore(state[level])
+        if "decoder" in state:
+            self._decoder.restore(state["decoder"])
 
     # -- one call ------------------------------------------------------------------------------------------------
 
@@ -214,8 +216,9 @@ class DirectMapper:
 
     def _outcome(self, frame: int, pose: np.ndarray, window: list[Keyframe]) -> MappingResult:
         """Wait for a call, and tell what came out."""
-        for level, rows in self._rows.items():
-            if rows.has_rejected:
-                _log.warning("frame %d: gradients of the %s were not finite and have been left out", frame, level)
+        rejected = {level: rows.has_rejected for level, rows in self._rows.items()}
+        for name, has_rejected in {**rejected, "colour decoder": self._decoder.has_rejected}.items():
+            if has_rejected:
+                _log.warning("frame %d: gradients of the %s were not finite and have been left out", frame, name)
         loss = float(self._batch.loss.numpy()[0]) / self._batch.count
         return MappingResult(pose, {"direct": loss}, sorted({keyframe.index for keyframe in window}))

@@ -1,4 +1,6 @@
-"""The two ways of mapping, one a loss (`mapping.loss`): what the rest of the program asks of both, and which it gets."""
+"""The two ways of mapping, one a loss (`mapping.loss`): what the rest of the program asks of both, and which it
+gets.
+"""
 
 from __future__ import annotations
 

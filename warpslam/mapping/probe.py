@@ -1,4 +1,4 @@
-"""Where the current frame's rays should go under the direct loss: to what the map has wrong, and to what it hardly knows.
+"""Where the current frame's rays should go under the direct loss: to what the map has wrong, and what it hardly knows.
 
 One ray a cell of the image, with a sample at its measured depth, where the logit should be 0, and one before it, at the
 depth of a pixel nearby where that is smaller: beside an outline free space is most likely to be taken for occupied.
