@@ -405,11 +405,7 @@ class Slam:
             raise InputError("the map is empty: step at least one frame first")
         T = check_transform(T_world_camera)
         arrays = self.scene.arrays()
-        at_surface = self.config.mapping.loss == "direct"
-        return render_image(
-            arrays, self.intrinsics, T, self.config.sampling, self.device,
-            depth=depth, stride=stride, at_surface=at_surface,
-        )  # fmt: skip
+        return render_image(arrays, self.intrinsics, T, self.config.sampling, self.device, depth=depth, stride=stride)
 
     def mesh(self, voxel: float | None = None, *, forecast: bool = False) -> trimesh.Trimesh:
         """Coloured mesh of what the mapped frames saw (A.4), in the world frame.

@@ -211,7 +211,7 @@ class SupervisionConfig(_Group):
     middle_rate: float = Field(0.05, gt=0, description="learning rate of middle features")
     fine_rate: float = Field(0.02, gt=0, description="learning rate of fine features")
     color_rate: float = Field(0.01, gt=0, description="learning rate of colour features")
-    decoder_rate: float = Field(0.001, gt=0, description="learning rate of the colour decoder, where it is trained")
+    decoder_rate: float = Field(0.003, gt=0, description="learning rate of the colour decoder, where it is trained")
     color_reach: float = Field(0.02, ge=0, description="samples get a colour so far from the surface [m]")
 
 

@@ -72,14 +72,6 @@ def take_surface_depth(batch: RayBatch, min_occupancy: float) -> None:
     batch.launcher.launch(compositing.surface_depth, batch.count, inputs)
 
 
-def shrink_to_surface(batch: RayBatch) -> None:
-    """After `render`: leave each ray one sample, where its logit first rises through zero, or at its mean depth."""
-    inputs = [batch.rays, batch.keep, batch.rendered, batch.depth, batch.surface]
-    batch.launcher.launch(compositing.crossing_depth, batch.count, inputs)
-    batch.launcher.call(partial(wp.copy, batch.z, batch.surface, count=batch.count))
-    batch.sample_count = 1
-
-
 def steep_samples(batch: RayBatch, first: int, stop: int, slot: int, min_gradient: float) -> Step:
     """List the samples of some rays whose logit has a gradient beyond ``min_gradient``."""
     inputs = [first, steep_list(batch, first, slot), batch.sample_count, batch.logit_grad, min_gradient]

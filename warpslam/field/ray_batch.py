@@ -68,7 +68,6 @@ class RayBatch:
         self.color = zeros(points, wp.vec3)
         self.weight = zeros(points)
         self.depth = zeros(capacity, float, True)
-        self.surface = zeros(capacity)
         self.rgb = zeros(capacity, wp.vec3, True)
         self.variance = zeros(capacity)
         self.loss = zeros(1, float, True)

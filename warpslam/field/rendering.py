@@ -10,7 +10,7 @@ import warp as wp
 from warpslam.camera import Intrinsics
 from warpslam.config import SamplingConfig
 from warpslam.field.arrays import FieldArrays
-from warpslam.field.passes import query, render, shrink_to_surface, take_surface_depth
+from warpslam.field.passes import render, take_surface_depth
 from warpslam.field.ray_batch import RayBatch
 from warpslam.poses import vector_from_pose
 from warpslam.runtime.phases import phase
@@ -43,24 +43,19 @@ def render_image(
     *,
     depth: np.ndarray | None = None,
     stride: int = 1,
-    at_surface: bool = False,
 ) -> RenderedImage:
     """Render the view from ``T_world_camera``, every ``stride``-th pixel.
-
-    Depth and colour are weighted means along the ray (Eq. 6), or, with ``at_surface``, those of the point at which the
-    logit rises through zero: for maps whose logit is a signed distance, of which a mean would be a blur before the
-    surface.
 
     With a ``depth`` image (H, W) [m], samples are placed around it as in mapping. Without one, a first pass spreads
     its samples
     evenly over the map, and the depth it finds places those of the second: nothing but the map enters.
     """
     if depth is None:
-        coarse = _render(arrays, camera, T_world_camera, sampling, device, None, stride, False)
+        coarse = _render(arrays, camera, T_world_camera, sampling, device, None, stride)
         depth = coarse.depth
     else:
         depth = np.ascontiguousarray(depth[::stride, ::stride], np.float32)
-    return _render(arrays, camera, T_world_camera, sampling, device, depth, stride, at_surface)
+    return _render(arrays, camera, T_world_camera, sampling, device, depth, stride)
 
 
 def _render(
@@ -71,7 +66,6 @@ def _render(
     device: wp.Device,
     depth: np.ndarray | None,
     stride: int,
-    at_surface: bool,
 ) -> RenderedImage:
     width = -(-camera.width // stride)
     height = -(-camera.height // stride)
@@ -89,20 +83,11 @@ def _render(
             batch.measured_depth[: batch.count].assign(depth[first : first + count].reshape(-1))
         batch.bound(arrays, use_depth=guided)
         batch.place_samples(stratified, sampling.surface, use_depth=guided)
-        render(batch, arrays, "color" if guided and not at_surface else "fine")
+        render(batch, arrays, "color" if guided else "fine")
         if not guided:
             # A mean between two surfaces would send the second pass's samples to where nothing is.
             take_surface_depth(batch, FIRST_PASS_OCCUPANCY)
-        arrays_of = {"variance": batch.variance, "depth": batch.depth, "rgb": batch.rgb}
-        if at_surface:
-            variance = batch.variance.numpy().copy()
-            shrink_to_surface(batch)
-            batch.color.zero_()
-            query(batch, arrays, "color")
-            arrays_of = {"depth": batch.surface, "rgb": batch.color}
-            out.variance[first : first + count] = variance[: batch.count].reshape(count, width)
-        for name, array in arrays_of.items():
-            image = getattr(out, name)
+        for image, array in ((out.depth, batch.depth), (out.rgb, batch.rgb), (out.variance, batch.variance)):
             image[first : first + count] = array.numpy()[: batch.count].reshape(count, width, *image.shape[2:])
     np.clip(out.rgb, 0.0, 1.0, out=out.rgb)
     return out

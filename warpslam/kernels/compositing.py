@@ -26,7 +26,6 @@ from warpslam.kernels.samples import Rays
 wp.set_module_options({"block_dim": 32})
 
 OUTSIDE_LOGIT = wp.constant(100.0)
-SOLID_LOGIT = wp.constant(0.15)
 # Slices run side by side: each has a cache line of its own.
 COUNT_STRIDE = wp.constant(16)
 
@@ -267,29 +266,6 @@ def surface_depth(
             if surface == 0.0 and rendered.logit[i] != OUTSIDE_LOGIT and occupancy(rendered.logit[i]) >= min_occupancy:
                 surface = rays.z[i]
     depth[tid] = wp.where(surface > 0.0, surface, halfway)
-
-
-@wp.kernel(enable_backward=False)
-def crossing_depth(rays: Rays, keep: wp.array[int], rendered: Rendered, depth: wp.array[float], z: wp.array[float]):
-    """Depth at which the logit first rises through zero and on to `SOLID_LOGIT`, between two samples on a line; where
-    it never does, ``depth``. One a ray. Less than solid is what an outline leaves beside it.
-    """
-    tid = wp.tid()
-    crossing = depth[tid]
-    if keep[tid] != 0:
-        found = int(0)
-        risen = float(0.0)
-        for n in range(1, rays.sample_count):
-            i = tid * rays.sample_count + n
-            before = rendered.logit[i - 1]
-            behind = rendered.logit[i]
-            if behind != OUTSIDE_LOGIT:
-                if before < 0.0 and behind >= 0.0:
-                    risen = rays.z[i - 1] + (rays.z[i] - rays.z[i - 1]) * before / (before - behind)
-                if found == 0 and risen > 0.0 and behind >= SOLID_LOGIT:
-                    found = 1
-                    crossing = risen
-    z[tid] = crossing
 
 
 @wp.kernel(enable_backward=False)
