@@ -22,7 +22,7 @@ from warpslam.field.decoders import Decoders
 from warpslam.field.rendering import RenderedImage, render_image
 from warpslam.frames import AdmittedFrame, FrameResult, FrameStatus, admit, check_settings, skipped
 from warpslam.mapping.frustum import measured_extent
-from warpslam.mapping.mapper import Mapper
+from warpslam.mapping.policy import new_mapper
 from warpslam.mapping.scheduler import MappingTask, new_scheduler
 from warpslam.meshing import extract_mesh
 from warpslam.poses import check_transform
@@ -96,7 +96,7 @@ class Slam:
         self.images = ImagePool(intrinsics, self.device, self.config.keyframes.max_gigabytes)
         self.tracker = Tracker(intrinsics, self.config.tracking, self.config.sampling, self.device, seed)
         self.localizer = Localizer(self.tracker, self.config.tracking, intrinsics)
-        self.mapper = Mapper(self.scene, intrinsics, self.config.mapping, self.config.sampling, self.device, seed)
+        self.mapper = new_mapper(self.scene, intrinsics, self.config, self.device, seed)
         self.direct = self._direct_tracker()
         self.timing_estimator = self._timing_estimator()
         self.scheduler = new_scheduler(self.config.schedule, self.mapper, self.images)
@@ -533,6 +533,7 @@ class Slam:
             direct=None if self.direct is None else self.direct.state(),
             digest=self._digest,
             timing_state=None if self.timing_estimator is None else self.timing_estimator.state(),
+            optimizer=self.mapper.state(),
         )
 
     @classmethod
@@ -549,6 +550,7 @@ class Slam:
         slam = cls(state.intrinsics, config, device, state.seed, decoders=state.scene.decoders, timing=state.timing)
         slam.history = FrameHistory.restored(state.history)
         slam.scene.restore(state.scene)
+        slam.mapper.restore(state.optimizer)
         images = [image for _, image in state.keyframes]
         slam.images.restore(state.current_image, state.current_motion, images)
         slam.keyframes = [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +16,20 @@ from warpslam.config import Config
 from warpslam.errors import ConfigError, InputError
 from warpslam.field.decoders import LEVELS, Decoders, DecoderWeights, expected_shapes
 from warpslam.frames import check_settings
+from warpslam.kernels.decoder.layout import COLOR_WEIGHT_ROWS
 from warpslam.runtime.cores import slice_count
 from warpslam.scene.feature_grid import GridState
 from warpslam.scene.image_pool import CompactImage
 from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
 from warpslam.scene.scene_map import SceneState
+from warpslam.scene.touched_rows import TouchedRowsState
 from warpslam.storage.state_file import StateFields, StateFormat, read_state, write_state
 from warpslam.tracking.direct.timing import TimingState
 from warpslam.tracking.direct.tracker import DirectState
 from warpslam.trajectory import HistoryState
 
-MAP_FORMAT = StateFormat("warpslam-map", 6, "the map of a run with --method nice-slam")
+MAP_FORMAT = StateFormat("warpslam-map", 7, "the map of a run with --method nice-slam")
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,8 @@ class SlamState:
     """By which the images of the last frame are known again."""
     timing_state: TimingState | None = None
     """What the estimate of the camera's timing goes on from."""
+    optimizer: dict[str, TouchedRowsState] = field(default_factory=dict)
+    """What mapping keeps of rows that were updated, by level."""
 
 
 def write_slam(path: Path, state: SlamState) -> None:
@@ -118,6 +122,7 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
         "seen": [seen.index for seen in state.seen],
         "direct": None if state.direct is None else _direct_header(state.direct),
         "timing_estimate": None if state.timing_state is None else _timing_header(state.timing_state),
+        "optimizer": list(state.optimizer),
     }
     rgb, depth, scale = state.current_image
     images = [image for _, image in state.keyframes]
@@ -146,6 +151,10 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
         arrays[f"grid_{level}_shape"] = np.array(grid.shape, np.int64)
         arrays[f"grid_{level}"] = grid.features
         arrays[f"grid_{level}_seen"] = grid.seen
+    for level, rows in state.optimizer.items():
+        arrays[f"optimizer_{level}_rows"] = rows.rows
+        arrays[f"optimizer_{level}_updates"] = rows.updates
+        arrays[f"optimizer_{level}_moments"] = rows.moments
     for weights in state.scene.decoders:
         for name, tensor in weights.tensors.items():
             arrays[f"decoder_{weights.level}:{name}"] = tensor
@@ -209,6 +218,7 @@ def state_from_arrays(
         direct=_direct(fields, count, len(frames)),
         digest=fields.header.get("digest"),
         timing_state=_timing_state(fields, count),
+        optimizer=_optimizer(fields),
     )
 
 
@@ -228,6 +238,25 @@ def _grid(fields: StateFields, level: str) -> GridState:
         fields.array(f"grid_{level}", np.float32, (rows, 32)),
         fields.array(f"grid_{level}_seen", np.uint8, (rows,)),
     )
+
+
+def _optimizer(fields: StateFields) -> dict[str, TouchedRowsState]:
+    levels = fields.header.get("optimizer")
+    if not isinstance(levels, list) or not set(levels) <= {*LEVELS, "decoder"}:
+        raise fields.damaged("optimizer", f"{levels!r} are no levels")
+    result = {}
+    for level in levels:
+        is_grid = level != "decoder"
+        total = int(np.prod(fields.array(f"grid_{level}_shape", np.int64, (3,)))) if is_grid else COLOR_WEIGHT_ROWS
+        rows = fields.array(f"optimizer_{level}_rows", np.int32, (None if is_grid else total,))
+        if len(rows) and (rows[0] < 0 or rows[-1] >= total or (np.diff(rows) <= 0).any()):
+            raise fields.damaged(f"optimizer_{level}_rows", f"not ascending rows below {total}")
+        result[level] = TouchedRowsState(
+            rows,
+            fields.array(f"optimizer_{level}_updates", np.int32, (len(rows),)),
+            fields.array(f"optimizer_{level}_moments", np.float32, (len(rows), 2, 32)),
+        )
+    return result
 
 
 def _image(fields: StateFields, n: int, scale: float, camera: Intrinsics) -> CompactImage:

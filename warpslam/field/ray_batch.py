@@ -91,7 +91,7 @@ class RayBatch:
         self.bits["coarse"] = self.bits["middle"]
         empty = wp.zeros((1, 1), dtype=Vec32, device=device)
         self.no_errors = wp.zeros((1, 1), dtype=float, device=device)
-        self.no_rows, self.no_selection = empty, wp.zeros(1, dtype=wp.uint8, device=device)
+        self.no_rows, self.no_places = empty, wp.zeros(1, dtype=int, device=device)
         self.activations = self.layer_grad = self.feature_grad = empty
         self.layer_inputs = wp.zeros((1, 1, 1), dtype=float, device=device)
         self.motion: MotionArrays | None = None
@@ -229,7 +229,7 @@ class RayBatch:
     ) -> None:
         """After `bound`: leave out the rays of other frames that the current one contradicts, for something has moved.
 
-        current: Its place in the window; its image is in slot 0.
+        current: Its first place in the window, whose last frames are the current one; its image is in slot 0.
         T_world_camera: Its pose (4, 4).
         margin: By how much [m].
         """

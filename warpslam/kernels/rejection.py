@@ -52,14 +52,15 @@ def drop_contradicted(
     depth: wp.array[float],
     keep: wp.array[int],
 ):
-    """Leave out the rays of earlier frames that the current depth image, in slot 0, contradicts by ``margin``: it sees
-    through the point they measured, or measures a surface that they pass through.
+    """Leave out the rays of earlier frames, those before ``current`` in the window, that the current depth image, in
+    slot 0, contradicts by ``margin``: it sees through the point they measured, or measures a surface that they pass
+    through.
 
     A ray is looked at every half ``margin``. A pixel speaks only where its neighbours agree, so that outlines, where a
     little shift of the camera changes everything, contradict nothing.
     """
     tid = wp.tid()
-    if keep[tid] == 0 or frame[tid] == current or depth[tid] <= 0.0:
+    if keep[tid] == 0 or frame[tid] >= current or depth[tid] <= 0.0:
         return
     count = int(depth[tid] / (0.5 * margin)) + 1
     for n in range(count):

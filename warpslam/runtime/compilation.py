@@ -28,12 +28,14 @@ _STAGES = (
     "kernels.losses",
     "kernels.grid",
     "views",
+    "supervision",
     "direct",
     "timing",
     "features",
 )
 _PYTHON_MODULES = {
     "warpslam.rays": ("pixels", "rays", "rejection", "samples"),
+    "warpslam.supervision": ("supervision", "touched_rows"),
     "warpslam.views": ("frustum", "images", "rectify", "seen", "visibility"),
     "warpslam.direct": ("direct.images", "direct.points", "direct.registration"),
     "warpslam.timing": ("direct.timing",),
