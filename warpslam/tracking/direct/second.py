@@ -12,12 +12,15 @@ import cv2
 import numpy as np
 import warp as wp
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import NO_MOTION, FrameMotion, Intrinsics
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
-from warpslam.tracking.features.detection import FeatureFrame, detect
+from warpslam.tracking.features.detection import FeatureFrame, SensorTiming, detect, retimed
 from warpslam.tracking.features.settings import FeatureSettings
-from warpslam.tracking.features.witness import FeatureWitness, Witness
+from warpslam.tracking.features.witness import FeatureRows, FeatureWitness, Witness
+
+LATEST = 2
+"""Frames whose features are kept."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +31,13 @@ class Picture:
     """uint8 (H, W, 3)."""
     depth: np.ndarray
     """float32 (H, W) [m]."""
+    index: int = -1
+    """Of the frame: its features are found once; -1 = it has none."""
 
     @classmethod
-    def of(cls, rgb: np.ndarray, units: np.ndarray, scale: float) -> Picture:
+    def of(cls, rgb: np.ndarray, units: np.ndarray, scale: float, index: int = -1) -> Picture:
         """From an image as the pool keeps it: depth in uint16, and metres per unit."""
-        return cls(rgb, units.astype(np.float32) * np.float32(scale))
+        return cls(rgb, units.astype(np.float32) * np.float32(scale), index)
 
     @property
     def grey(self) -> np.ndarray:
@@ -57,7 +62,8 @@ class SecondWitness:
         self.camera, self.keyframes, self.images = camera, keyframes, images
         self.settings = FeatureSettings(max_depth=max_depth)
         self._witness = FeatureWitness(camera, device, self.settings)
-        self._known: set[int] = set()
+        self._known: dict[int, FrameMotion] = {}  # the motion that a keyframe's features were corrected by
+        self._latest: dict[int, FeatureFrame] = {}  # of frames, by index
 
     @property
     def depth_sigma(self) -> float:
@@ -88,15 +94,38 @@ class SecondWitness:
         self._learn(keyframes)
         return self._witness.relocalize(self._features(frame), self._poses(keyframes), keyframes)
 
+    def rows(
+        self, frame: Picture, motion: FrameMotion, pose: np.ndarray, keyframes: Sequence[int]
+    ) -> FeatureRows | None:
+        """Matches of a frame whose pose is nearly known with keyframes, all at the times when they were seen."""
+        self._learn(keyframes)
+        features = self._retimed(self._features(frame), frame, motion)
+        return self._witness.rows(features, self._poses(keyframes), keyframes, pose)
+
     def _poses(self, keyframes: Sequence[int]) -> dict[int, np.ndarray]:
         return {number: self.keyframes[number].pose for number in keyframes}
 
     def _features(self, picture: Picture) -> FeatureFrame:
-        return detect(picture.grey, picture.depth, self.camera, self.settings)
+        if picture.index in self._latest:
+            return self._latest[picture.index]
+        found = detect(picture.grey, picture.depth, self.camera, self.settings)
+        if picture.index >= 0:
+            self._latest[picture.index] = found
+            while len(self._latest) > LATEST:
+                del self._latest[min(self._latest)]
+        return found
+
+    def _retimed(self, features: FeatureFrame, picture: Picture, motion: FrameMotion) -> FeatureFrame:
+        if motion.is_none:
+            return features
+        timing = SensorTiming(motion.depth_offset, motion.readout)
+        return retimed(features, picture.depth, self.camera, self.settings, timing, np.array(motion.twist))
 
     def _learn(self, keyframes: Sequence[int]) -> None:
         for number in keyframes:
-            if number not in self._known:
-                picture = Picture.of(*self.images.kept(self.keyframes[number].image).unpack(self.camera))
-                self._witness.add_keyframe(number, self._features(picture))
-                self._known.add(number)
+            keyframe = self.keyframes[number]
+            if self._known.get(number) != keyframe.motion:
+                picture = Picture.of(*self.images.kept(keyframe.image).unpack(self.camera))
+                features = self._retimed(self._features(picture), picture, keyframe.motion)
+                self._witness.add_keyframe(number, features)
+                self._known[number] = keyframe.motion

@@ -25,12 +25,13 @@ from warpslam.kernels.direct import points, registration
 from warpslam.poses import inverse, motion_between, motion_of, orthonormalized, twist_of
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
+from warpslam.tracking.direct.joint_rows import LINEARIZATIONS, WEAK_SIGMA, feature_rows, is_far, weakest_sigma
 from warpslam.tracking.direct.measures import Measures
 from warpslam.tracking.direct.pyramid import PyramidPlan, records
 from warpslam.tracking.direct.registrar import Floors, Registrar, new_tasks
 from warpslam.tracking.direct.second import Picture, SecondWitness
 from warpslam.tracking.direct.window import Pose, refine_window
-from warpslam.tracking.features.witness import Witness
+from warpslam.tracking.features.witness import FeatureRows, Witness
 from warpslam.trajectory import TWIST_STEPS, FrameHistory, Located
 
 RECENT = 4
@@ -161,7 +162,9 @@ class _Before:
     @property
     def picture(self) -> Picture:
         """The frame as it comes back from a file."""
-        return Picture(self.rgb, self.depth) if self.kept is None else Picture.of(*self.kept)
+        if self.kept is None:
+            return Picture(self.rgb, self.depth, self.index)
+        return Picture.of(*self.kept, self.index)
 
 
 @dataclass(frozen=True)
@@ -373,7 +376,7 @@ class DirectTracker:
 
     def _why_doubted(self, done: Followed) -> str:
         """What speaks against a pose that fits; empty if nothing does."""
-        back, sigma = done.attempt.back, float(np.linalg.eigvalsh(done.covariance[:3, :3])[-1]) ** 0.5
+        back, sigma = done.attempt.back, weakest_sigma(done.covariance)
         # Not by grey values: thin lines are lost at this level.
         if back is not None and back.agreement < self.config.lost_agreement:
             return f"looked at from the frame, only {back.agreement:.0%} of the keyframe's depth agrees"
@@ -442,6 +445,8 @@ class DirectTracker:
         )
         result, last = started.numpy()[0].copy(), final.numpy()[0].copy()
         self._overlap = dict(zip(near, shares.numpy()[: len(near)].tolist(), strict=True))
+        if self._wants_features(last, best):
+            last = self._join_features(started, last, joint, to_reference, reference, frame, history)
         attempt = replace(self._attempt(reference, result), moved=self._shift(row, task[0]["T"], result["T"]))
         if best is not None:
             attempt = replace(
@@ -459,6 +464,54 @@ class DirectTracker:
             self._depth_error(row, attempt),
             covariance_of(np.asarray(last["H"], np.float64)),
         )
+
+    def _wants_features(self, last: np.ndarray, best: Attempt | None) -> bool:
+        """Whether features' rows should join those of the images, which came to ``last``."""
+        when = self.config.feature_rows
+        if when != "doubt" or not last["ok"]:
+            return when == "always" and bool(last["ok"])
+        return best is not None or weakest_sigma(covariance_of(np.asarray(last["H"], np.float64))) > WEAK_SIGMA
+
+    def _join_features(
+        self,
+        started: wp.array,
+        last: np.ndarray,
+        joint: Any,
+        to_reference: np.ndarray,
+        reference: int,
+        frame: AdmittedFrame,
+        history: FrameHistory,
+    ) -> np.ndarray:
+        """The joint registration once more, with rows of features: its `registration.Result`."""
+        W = self.keyframes[reference].pose
+        pose = W @ inverse(np.asarray(last["T"], np.float64))
+        motion = self._motion_at(pose, frame, history)
+        features = self._second.rows(self._picture(frame), motion, pose, self._likely(reference))
+        for _ in range(LINEARIZATIONS):
+            T = orthonormalized(np.asarray(last["T"], np.float64))
+            others = None if features is None else feature_rows(features, W, T)
+            if others is None:
+                break
+            joint["others"] = len(others)
+            last = self.registrar.join(started, joint, to_reference, others).numpy()[0].copy()
+            if not is_far(T, np.asarray(last["T"], np.float64)):
+                break
+        return last
+
+    def _motion_at(self, pose: np.ndarray, frame: AdmittedFrame, history: FrameHistory) -> FrameMotion:
+        """How the camera moved while it took a frame that is at ``pose``."""
+        motion, earlier = self._motions[frame.index], history.earlier(TWIST_STEPS - 1)
+        if (motion.depth_offset == 0.0 and motion.readout == 0.0) or earlier is None:
+            return motion
+        elapsed = frame.timestamp - history.timestamp(earlier)
+        if elapsed <= 0:
+            return motion
+        return motion.with_twist(twist_of(inverse(history.pose(earlier)) @ pose) / elapsed)
+
+    def _likely(self, reference: int) -> list[int]:
+        """Keyframes whose features a frame is matched with."""
+        likely = sorted(self._overlap.items(), key=lambda item: -item[1])
+        return list(dict.fromkeys([reference, *(k for k, _ in likely)]))[:WITNESS_KEYFRAMES]
 
     def _measure_back(self, row: int, keyframe: int, T_frame_keyframe: np.ndarray) -> Measures:
         """How well a keyframe fits the points of a frame."""
@@ -571,16 +624,15 @@ class DirectTracker:
     def _picture(self, frame: AdmittedFrame) -> Picture:
         """The frame as it comes back from a file."""
         if not self.device.is_cpu:
-            return Picture(frame.rgb, frame.depth)
-        return Picture.of(*self.images.current())
+            return Picture(frame.rgb, frame.depth, frame.index)
+        return Picture.of(*self.images.current(), frame.index)
 
     def _ask(self, picture: Picture, history: FrameHistory, foretold: np.ndarray) -> Witness | None:
         """What features say, if the frame follows one whose pose is known."""
         before = self._before
         if before is None or not history.was_known:
             return None
-        likely = sorted(self._overlap.items(), key=lambda item: -item[1])
-        keyframes = list(dict.fromkeys([self._reference, *(k for k, _ in likely)]))[:WITNESS_KEYFRAMES]
+        keyframes = self._likely(self._reference)
         return self._second.locate(picture, before.picture, history.last_pose, foretold, keyframes)
 
     def _judge(self, row: int, best: Attempt | None, witness: Witness | None) -> Attempt | None:
