@@ -218,7 +218,8 @@ class DirectConfig(_Group):
     search_steps: int = Field(16, ge=1, le=64, description="steps of a pixel along these, both ways")
     feature_rows: Literal["doubt", "always", "never"] = Field(
         "never",
-        description="when rows of sparse features join those of the images: in frames that are in doubt, in all, in none",
+        description="frames where rows of sparse features join those of the images: those in doubt and those with a "
+        "weakly determined direction, all (some 25 ms more a frame), or none",
     )
     relocalization_keyframes: int = Field(60, ge=1, description="latest keyframes that a lost camera is looked for at")
 

@@ -222,11 +222,13 @@ def half_depth(sequence: RgbdSequence, *, seed: int = 0, share: float = 0.5) -> 
     return AlteredSequence(sequence, "half", change=change)
 
 
-def carry_lamp(sequence: RgbdSequence, *, share: float = 0.75, reach: float = 1.0, spot: float = 25.0) -> AlteredSequence:
+def carry_lamp(
+    sequence: RgbdSequence, *, share: float = 0.5, reach: float = 1.0, spot: float = 25.0
+) -> AlteredSequence:
     """``share`` of the light comes from a lamp on the camera: shading goes along with the camera, not with the surface.
 
-    It falls off with the distance as 1 / (1 + (d / ``reach``)^2) [m], and from the middle as a bell of ``spot`` degrees;
-    where depth is missing as at 5 m. The brightest place is as bright as before.
+    It falls off with the distance as 1 / (1 + (d / ``reach``)^2) [m], and from the middle as a bell of ``spot``
+    degrees; where depth is missing as at 5 m. The brightest place is as bright as before.
     """
     k = sequence.intrinsics
     v, u = np.mgrid[: k.height, : k.width]

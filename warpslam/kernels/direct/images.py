@@ -13,11 +13,6 @@ wp.get_module(MODULE).options.update({"enable_backward": False, "max_unroll": 1,
 NEAR = wp.constant(1.03)
 """Depths up to this multiple of the nearest belong to the same surface."""
 
-SHADING_WIDTH = wp.constant(4.0)
-"""Standard deviation of the mean that counts as slow shading [px of a level]."""
-SHADING_REACH = wp.constant(12)
-"""Pixels of that mean to either side."""
-
 
 @wp.struct
 class Level:
@@ -126,55 +121,6 @@ def halve(n: int, levels: wp.array[Level], row: int, images: Images):
                     count += 1.0
         depth = depth / count
     images.depth[row, level.first + i] = depth
-
-
-@wp.func
-def bell(k: int) -> float:
-    """Weight of a pixel ``k`` away in the mean that slow shading is."""
-    x = float(k) / SHADING_WIDTH
-    return wp.exp(-0.5 * x * x)
-
-
-@wp.kernel(module=MODULE, enable_backward=False)
-def smooth_rows(levels: wp.array[Level], row: int, start: int, images: Images, smoothed: wp.array[float]):
-    """The Gaussian mean along image rows, of every level whose shading is taken out."""
-    i = start + wp.tid()
-    n = int(0)
-    while n + 1 < levels.shape[0] and i >= levels[n + 1].first:
-        n += 1
-    level = levels[n]
-    u = (i - level.first) % level.width
-    sum = float(0.0)
-    weights = float(0.0)
-    for k in range(-wp.min(SHADING_REACH, u), wp.min(SHADING_REACH, level.width - 1 - u) + 1):
-        w = bell(k)
-        sum += w * images.grey[row, i + k]
-        weights += w
-    smoothed[i] = sum / weights
-
-
-@wp.kernel(module=MODULE, enable_backward=False)
-def take_shading_out(
-    levels: wp.array[Level], row: int, start: int, smoothed: wp.array[float], images: Images, target: int
-):
-    """Grey values less their Gaussian mean, and depth as it is, into row ``target``."""
-    i = start + wp.tid()
-    images.depth[target, i] = images.depth[row, i]
-    if i >= smoothed.shape[0]:
-        images.grey[target, i] = images.grey[row, i]
-        return
-    n = int(0)
-    while n + 1 < levels.shape[0] and i >= levels[n + 1].first:
-        n += 1
-    level = levels[n]
-    v = (i - level.first) / level.width
-    sum = float(0.0)
-    weights = float(0.0)
-    for k in range(-wp.min(SHADING_REACH, v), wp.min(SHADING_REACH, level.height - 1 - v) + 1):
-        w = bell(k)
-        sum += w * smoothed[i + k * level.width]
-        weights += w
-    images.grey[target, i] = images.grey[row, i] - sum / weights
 
 
 @wp.kernel(module=MODULE, enable_backward=False)

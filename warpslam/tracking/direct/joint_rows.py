@@ -8,23 +8,22 @@ from warpslam.kernels.direct import registration
 from warpslam.poses import inverse, motion_between
 from warpslam.tracking.direct.pyramid import records
 from warpslam.tracking.features.witness import FeatureRows
-import os
+
 LEAST_INLIERS = 20
 """Features that must agree with a pose for their rows to count."""
-FEATURE_WEIGHT = float(os.environ.get("FW", "5.0"))
-"""Of a feature's row against one of the images. On rendered sequences, where the truth is known, squared errors of poses
+FEATURE_WEIGHT = 5.0
+"""Of a feature's row against one of the images. On rendered sequences, whose truth is known, squared errors of poses
 are 15 to 54 times what the images' normal matrix says, and 3 to 4 times what that of the features says.
 """
-WEAK_SIGMA = float(os.environ.get("WEAK", "0.005"))
+WEAK_SIGMA = 0.005
 """Standard deviation [m] of the position from which a direction counts as weak: features are asked."""
 LINEARIZATIONS = 2
+"""Times that rows are linearised, at most."""
 FAR_STEP, FAR_TURN = 0.01, 0.5
 """A pose that is further [m], [degrees] from where rows were linearised needs them anew."""
 
 
-def feature_rows(
-    rows: FeatureRows, T_world_reference: np.ndarray, T_frame_reference: np.ndarray
-) -> np.ndarray | None:
+def feature_rows(rows: FeatureRows, T_world_reference: np.ndarray, T_frame_reference: np.ndarray) -> np.ndarray | None:
     """Rows linearised at a pose, `registration.OtherRows` (1,); None where too few features agree with it.
 
     Args:

@@ -15,8 +15,6 @@ from warpslam.tracking.direct.pyramid import PyramidPlan, records
 
 FIRST_KEYFRAMES = 16
 """Rows of points to begin with; they double as keyframes come."""
-SHADING_LEVELS = 3
-"""Levels, the largest, whose slow shading can be taken out."""
 OVERLAP_STRIDE = 2
 """Every second point tells enough of an overlap."""
 
@@ -71,7 +69,7 @@ class Registrar:
 
     def load(self, row: int, rgb: wp.array, units: wp.array, scale: wp.array) -> None:
         """Build the pyramid of an image: uint8 (H, W, 3), uint16 (H, W), and metres per unit (1,)."""
-        levels = self.plan.levels
+        levels, last = self.plan.levels, self.plan.levels[-1]
         self._mean_depths.pop(row, None)
 
         def base(first: int, stop: int, slot: int) -> list[Step]:
@@ -84,36 +82,11 @@ class Registrar:
                 images.halve, int(level["width"] * level["height"]), [n, self._levels, row, self._images]
             )
 
-        self._differentiate(row)
-        self.set_motion(row, None)
-
-    def _differentiate(self, row: int) -> None:
         def shades(first: int, stop: int, slot: int) -> list[Step]:
             return [(images.differentiate, stop - first, [self._levels, row, first, self._images])]
 
-        self._launcher.slices(self.plan.pixels, shades)
-
-    def take_shading_out(self, row: int, target: int) -> None:
-        """Build the images of ``row`` without slow shading (less their Gaussian mean on the largest levels): edges and
-        texture, which stay where surfaces are when a lamp moves.
-        """
-        self._mean_depths.pop(target, None)
-        count = int(self.plan.levels[min(SHADING_LEVELS, self.plan.top)]["first"])
-        smoothed = self._buffers.get("smoothed")
-        if smoothed is None:
-            smoothed = self._buffers["smoothed"] = wp.zeros(count, dtype=float, device=self.device)
-
-        def smooth(first: int, stop: int, slot: int) -> list[Step]:
-            return [(images.smooth_rows, stop - first, [self._levels, row, first, self._images, smoothed])]
-
-        def subtract(first: int, stop: int, slot: int) -> list[Step]:
-            inputs = [self._levels, row, first, smoothed, self._images, target]
-            return [(images.take_shading_out, stop - first, inputs)]
-
-        self._launcher.slices(count, smooth)
-        self._launcher.slices(self.plan.pixels, subtract)
-        self._differentiate(target)
-        self._motions[target : target + 1].assign(self._motions[row : row + 1])
+        self._launcher.slices(int(last["first"] + last["width"] * last["height"]), shades)
+        self.set_motion(row, None)
 
     def set_motion(self, row: int, motion: np.ndarray | None) -> None:
         """How the camera moved while it took the image: a `points.Motion`; None = it stood still."""

@@ -6,7 +6,7 @@ Features of a frame are computed when somebody asks for them, from the images th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -33,11 +33,13 @@ class Picture:
     """float32 (H, W) [m]."""
     index: int = -1
     """Of the frame: its features are found once; -1 = it has none."""
+    motion: FrameMotion = NO_MOTION
+    """Of the camera while it took the frame, by which features are brought to one time."""
 
     @classmethod
-    def of(cls, rgb: np.ndarray, units: np.ndarray, scale: float, index: int = -1) -> Picture:
+    def of(cls, rgb: np.ndarray, units: np.ndarray, scale: float) -> Picture:
         """From an image as the pool keeps it: depth in uint16, and metres per unit."""
-        return cls(rgb, units.astype(np.float32) * np.float32(scale), index)
+        return cls(rgb, units.astype(np.float32) * np.float32(scale))
 
     @property
     def grey(self) -> np.ndarray:
@@ -63,7 +65,7 @@ class SecondWitness:
         self.settings = FeatureSettings(max_depth=max_depth)
         self._witness = FeatureWitness(camera, device, self.settings)
         self._known: dict[int, FrameMotion] = {}  # the motion that a keyframe's features were corrected by
-        self._latest: dict[int, FeatureFrame] = {}  # of frames, by index
+        self._latest: dict[int, FeatureFrame] = {}  # of frames as they were found, by index
 
     @property
     def depth_sigma(self) -> float:
@@ -94,38 +96,31 @@ class SecondWitness:
         self._learn(keyframes)
         return self._witness.relocalize(self._features(frame), self._poses(keyframes), keyframes)
 
-    def rows(
-        self, frame: Picture, motion: FrameMotion, pose: np.ndarray, keyframes: Sequence[int]
-    ) -> FeatureRows | None:
-        """Matches of a frame whose pose is nearly known with keyframes, all at the times when they were seen."""
+    def rows(self, frame: Picture, pose: np.ndarray, keyframes: Sequence[int]) -> FeatureRows | None:
+        """Matches of a frame whose pose is nearly known with keyframes; see `FeatureWitness.rows`."""
         self._learn(keyframes)
-        features = self._retimed(self._features(frame), frame, motion)
-        return self._witness.rows(features, self._poses(keyframes), keyframes, pose)
+        return self._witness.rows(self._features(frame), self._poses(keyframes), keyframes, pose)
 
     def _poses(self, keyframes: Sequence[int]) -> dict[int, np.ndarray]:
         return {number: self.keyframes[number].pose for number in keyframes}
 
     def _features(self, picture: Picture) -> FeatureFrame:
-        if picture.index in self._latest:
-            return self._latest[picture.index]
-        found = detect(picture.grey, picture.depth, self.camera, self.settings)
+        found = self._latest.get(picture.index)
+        if found is None:
+            found = detect(picture.grey, picture.depth, self.camera, self.settings)
         if picture.index >= 0:
             self._latest[picture.index] = found
             while len(self._latest) > LATEST:
                 del self._latest[min(self._latest)]
-        return found
-
-    def _retimed(self, features: FeatureFrame, picture: Picture, motion: FrameMotion) -> FeatureFrame:
-        if motion.is_none:
-            return features
-        timing = SensorTiming(motion.depth_offset, motion.readout)
-        return retimed(features, picture.depth, self.camera, self.settings, timing, np.array(motion.twist))
+        if picture.motion.is_none:
+            return found
+        timing = SensorTiming(picture.motion.depth_offset, picture.motion.readout)
+        return retimed(found, picture.depth, self.camera, self.settings, timing, np.array(picture.motion.twist))
 
     def _learn(self, keyframes: Sequence[int]) -> None:
         for number in keyframes:
             keyframe = self.keyframes[number]
             if self._known.get(number) != keyframe.motion:
                 picture = Picture.of(*self.images.kept(keyframe.image).unpack(self.camera))
-                features = self._retimed(self._features(picture), picture, keyframe.motion)
-                self._witness.add_keyframe(number, features)
+                self._witness.add_keyframe(number, self._features(replace(picture, motion=keyframe.motion)))
                 self._known[number] = keyframe.motion

@@ -31,7 +31,7 @@ from warpslam.tracking.direct.pyramid import PyramidPlan, records
 from warpslam.tracking.direct.registrar import Floors, Registrar, new_tasks
 from warpslam.tracking.direct.second import Picture, SecondWitness
 from warpslam.tracking.direct.window import Pose, refine_window
-from warpslam.tracking.features.witness import FeatureRows, Witness
+from warpslam.tracking.features.witness import Witness
 from warpslam.trajectory import TWIST_STEPS, FrameHistory, Located
 
 RECENT = 4
@@ -162,9 +162,8 @@ class _Before:
     @property
     def picture(self) -> Picture:
         """The frame as it comes back from a file."""
-        if self.kept is None:
-            return Picture(self.rgb, self.depth, self.index)
-        return Picture.of(*self.kept, self.index)
+        found = Picture(self.rgb, self.depth) if self.kept is None else Picture.of(*self.kept)
+        return replace(found, index=self.index)
 
 
 @dataclass(frozen=True)
@@ -485,8 +484,8 @@ class DirectTracker:
         """The joint registration once more, with rows of features: its `registration.Result`."""
         W = self.keyframes[reference].pose
         pose = W @ inverse(np.asarray(last["T"], np.float64))
-        motion = self._motion_at(pose, frame, history)
-        features = self._second.rows(self._picture(frame), motion, pose, self._likely(reference))
+        picture = replace(self._picture(frame), motion=self._motion_at(pose, frame, history))
+        features = self._second.rows(picture, pose, self._likely(reference))
         for _ in range(LINEARIZATIONS):
             T = orthonormalized(np.asarray(last["T"], np.float64))
             others = None if features is None else feature_rows(features, W, T)
@@ -623,9 +622,10 @@ class DirectTracker:
 
     def _picture(self, frame: AdmittedFrame) -> Picture:
         """The frame as it comes back from a file."""
+        motion = self._motions[frame.index]
         if not self.device.is_cpu:
-            return Picture(frame.rgb, frame.depth, frame.index)
-        return Picture.of(*self.images.current(), frame.index)
+            return Picture(frame.rgb, frame.depth, frame.index, motion)
+        return replace(Picture.of(*self.images.current()), index=frame.index, motion=motion)
 
     def _ask(self, picture: Picture, history: FrameHistory, foretold: np.ndarray) -> Witness | None:
         """What features say, if the frame follows one whose pose is known."""
@@ -633,7 +633,8 @@ class DirectTracker:
         if before is None or not history.was_known:
             return None
         keyframes = self._likely(self._reference)
-        return self._second.locate(picture, before.picture, history.last_pose, foretold, keyframes)
+        earlier = replace(before.picture, motion=self._motions.get(before.index, NO_MOTION))
+        return self._second.locate(picture, earlier, history.last_pose, foretold, keyframes)
 
     def _judge(self, row: int, best: Attempt | None, witness: Witness | None) -> Attempt | None:
         """Where features say something else, a third measure decides: which of both answers the images fit better."""
