@@ -256,6 +256,11 @@ class DirectConfig(_Group):
     search_kept: int = Field(3, ge=1, le=20, description="rotations tried further")
     search_weak: bool = Field(True, description="search along the two motions that depth determines least, too")
     search_steps: int = Field(16, ge=1, le=64, description="steps of a pixel along these, both ways")
+    feature_rows: Literal["doubt", "always", "never"] = Field(
+        "never",
+        description="frames where rows of sparse features join those of the images: those in doubt and those with a "
+        "weakly determined direction, all (some 25 ms more a frame), or none",
+    )
     relocalization_keyframes: int = Field(60, ge=1, description="latest keyframes that a lost camera is looked for at")
 
 
