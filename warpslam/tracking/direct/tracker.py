@@ -85,6 +85,10 @@ eleven rendered sequences 98 % of true errors lie within two sigma, 91 % on the 
 """
 MAX_SIGMA = 0.05
 """Standard deviation [m] beyond which a direction is left open, as the normal matrix alone has it."""
+RISING, SECOND_LOOK = 1.25, 0.8
+"""A cost beyond the first multiple of the usual one is worth a second look, which must cost less than the second
+multiple of it.
+"""
 LEAST_COST = 0.5
 """A registration that costs less needs no comparison with others."""
 SEARCH_WIDE, SEARCH_DEEP = 6, 3
@@ -297,6 +301,11 @@ class DirectTracker:
         done: Followed | None = None
         if history.was_known or found is not None:
             done = self._follow(row, self._reference, starts[0], frame, history)
+            if self._foretold is not None and done.attempt.cost > RISING * self._typical_cost:
+                # Thin lines are lost on small images, which may have led away from what was foretold.
+                again = self._follow(row, self._reference, starts[0], frame, history, top=self.judged)
+                if again.attempt.ok and again.attempt.cost < SECOND_LOOK * done.attempt.cost:
+                    done = again
             if self._is_sure(done.attempt):
                 self.counts["sure"] += 1
             else:
@@ -311,13 +320,15 @@ class DirectTracker:
             pose = self._pose_of(best)
             self._overlap = self._overlaps_at(row, pose)
             done = self._follow(row, best.keyframe, pose, frame, history, best)
+        pose = orthonormalized(self.keyframes[done.attempt.keyframe].pose @ inverse(done.T_frame_reference))
         why = self._why_doubted(done)
+        if not why and best is not None and self._foretold is not None and self._is_untold(row, pose):
+            why = "it is not where constant speed foretold it, and other places look alike from there"
         if why:
             self._found = None
             self._keep_before(history)
             return self._lost(row, done.attempt, why, history)
         self._reference = done.attempt.keyframe
-        pose = orthonormalized(self.keyframes[self._reference].pose @ inverse(done.T_frame_reference))
         if not history.was_known:
             why = self._confirm(row, pose, done.attempt, history)
             if why:
@@ -419,8 +430,12 @@ class DirectTracker:
             is_alike = other.measures.agreement > FOUND_AGREEMENT and other.cost < UNIQUE * attempt.cost
             if is_alike and _is_elsewhere(pose, self._pose_of(other)):
                 return True
+        return self._is_untold(row, pose)
+
+    def _is_untold(self, row: int, pose: np.ndarray) -> bool:
+        """Whether a frame does not tell where it is, and did not go on as it did, no period of the surface further."""
         if self._foretold is not None and motion_between(self._foretold, pose)[0] < SAME_STEP:
-            return False  # it goes on as it did: no period further
+            return False
         weights = self.config.grey_weight, self.config.depth_weight
         return difference_elsewhere(self.registrar, row, SCRATCH, weights, SAME_STEP) < TELLING
 
@@ -444,14 +459,17 @@ class DirectTracker:
         frame: AdmittedFrame,
         history: FrameHistory,
         best: Attempt | None = None,
+        top: int | None = None,
     ) -> Followed:
         """Register to the reference from a pose, then to all keyframes of large overlap, and look back.
 
-        best: What the pose comes from: only the largest level is left to do.
+        best: What the pose comes from: only the largest level is left to do. top: Level to begin at, the middle one by
+        default.
         """
         W = self.keyframes[reference].pose
+        top = self.plan.middle if top is None else top
         task = self._task()
-        task["keyframe"], task["row"], task["top"], task["low"] = self._points_of(reference), row, self.plan.middle, 0
+        task["keyframe"], task["row"], task["top"], task["low"] = self._points_of(reference), row, top, 0
         task["cost_level"] = 0
         task["T"] = inverse(start) @ W
         if best is not None:
@@ -589,6 +607,7 @@ class DirectTracker:
         limit = max(6.0, 2.0 * self._typical_scale)
         return (
             attempt.ok
+            and self._foretold is not None
             and m.agreement > config.sure_agreement
             and m.correlation > config.sure_correlation
             and m.view > 0.4
