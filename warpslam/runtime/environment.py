@@ -12,9 +12,12 @@ from typing import TYPE_CHECKING
 
 import psutil
 
+from warpslam.errors import MapSizeError
+
 if TYPE_CHECKING:
     import warp as wp
 
+_TOO_SMALL_TO_ASK = 1 << 26
 PACKAGES = ("warp-lang", "torch", "numpy", "scipy", "trimesh", "opencv-python-headless", "open3d")
 
 
@@ -62,6 +65,24 @@ def resident_bytes() -> int:
 def free_gigabytes(device: wp.Device) -> float:
     """Memory of a device, or of the machine for the CPU, that is not in use [GB]."""
     return (device.free_memory if device.is_cuda else psutil.virtual_memory().available) / 1e9
+
+
+def check_memory(device: wp.Device, size: float, what: str) -> None:
+    """Whether a device has room for something, asked before it is allocated.
+
+    Args:
+        device: Where it will be.
+        size: What it takes [bytes].
+        what: Its name and what makes it smaller, for the message.
+
+    Raises:
+        MapSizeError: It has not.
+    """
+    if size < _TOO_SMALL_TO_ASK:
+        return
+    free = free_gigabytes(device)
+    if free is not None and size / 1e9 > free:
+        raise MapSizeError(f"{what}: {size / 1e9:.1f} GB are needed, and {device} has {free:.1f} GB free")
 
 
 def peak_memory_mib() -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
@@ -17,6 +18,11 @@ from warpslam.runtime.cores import MAX_SLICES
 def _pool() -> ThreadPoolExecutor:
     # Tracking and mapping may both run slices (`mapping.scheduler`), and neither should queue behind the other.
     return ThreadPoolExecutor(max_workers=2 * (MAX_SLICES - 1), thread_name_prefix="warpslam")
+
+
+if hasattr(os, "register_at_fork"):
+    # Threads do not survive a fork: a child that waited for those of its parent would wait for ever.
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 class Program:
