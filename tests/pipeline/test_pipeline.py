@@ -61,7 +61,7 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
     assert {file.name for file in folder.path.iterdir()} == {
         "config.yaml", "trajectory.tum", "ground_truth.tum", "mesh.ply", "map.safetensors", "metrics.json",
         "timing.json", "input.json", "log.txt", "trajectory_top_view.png", "error_over_time.png", "panels.png",
-        "panels.npz", "frames.csv", "frames.json", "report.html",
+        "panels.npz", "frames.csv", "frames.json", "report.html", "manifest.json",
     }  # fmt: skip
     assert yaml.safe_load(folder.config.read_text())["mapping"]["window"] == Config().mapping.window
     metrics = metrics_of(folder.path)

@@ -30,6 +30,7 @@ from warpslam.runtime.cores import process_cores
 
 RETRIES = 3
 """How often a sequence is started again after its worker was lost."""
+LOCALHOST = "127.0.0.1"
 _POLL_SECONDS = 0.5
 _MAX_CORES = 8  # more than that a run does not use
 
@@ -83,6 +84,8 @@ def _connect(ray: Any, address: str) -> None:
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "warning"}
     if address == "local":
         options |= {"address": "local", "num_cpus": len(process_cores()), "include_dashboard": False}
+        # Nobody else is to reach it; without this Ray listens on every interface.
+        options["_node_ip_address"] = LOCALHOST
     else:
         options["address"] = address
     try:

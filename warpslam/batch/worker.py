@@ -17,8 +17,8 @@ from warpslam.batch.status import FAILED, INTERRUPTED, MEMORY, RUNNING, BatchSta
 from warpslam.errors import MemoryBudgetError, WarpSlamError
 from warpslam.pipeline.methods import has_checkpoints
 from warpslam.pipeline.observer import Observer
-from warpslam.runs.folder import RunFolder
 from warpslam.runtime.environment import resident_bytes
+from warpslam.runtime.stopping import terminable
 
 if TYPE_CHECKING:
     from warpslam.runs.record import Progress
@@ -43,12 +43,18 @@ def main() -> None:
     # The run folder's log.txt has the rest.
     handler.setLevel(logging.WARNING)
     logging.basicConfig(format="%(levelname)s: %(message)s", handlers=[handler])
-    execute(Job.from_dict(order["job"]), Path(order["output"]), _print, order["memory_gb"], slot=order["slot"])
+    with terminable():
+        execute(Job.from_dict(order["job"]), Path(order["output"]), _print, order["memory_gb"], slot=order["slot"])
 
 
 def _print(news: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(news) + "\n")
-    sys.stdout.flush()
+    try:
+        sys.stdout.write(json.dumps(news) + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Nobody listens any more: the batch was ended. What is done is written, and the same batch goes on from there.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise KeyboardInterrupt from None
 
 
 def execute(job: Job, output: Path, report: Report, memory_gb: float | None = None, *, slot: int = 0) -> str:
@@ -66,9 +72,6 @@ def execute(job: Job, output: Path, report: Report, memory_gb: float | None = No
     start = time.monotonic()
     state = BatchState.of(job, output)
     has_same_settings = state.fields.get("settings") == job.settings_hash
-    if not has_same_settings:
-        # Before the state file says otherwise: the next process would take them for its own.
-        RunFolder(output / job.name).remove_checkpoints()
     if not has_same_settings or state.fields.get("status") != RUNNING:
         state.fields.clear()
     elif state.fields.get("ending") == MEMORY:

@@ -179,13 +179,13 @@ def read_checkpoint(folder: RunFolder) -> SavedRun:
     Raises:
         CheckpointError: There is none; says what is wrong with each.
     """
+    folder.finish_taking_place()
     found = [path for path in (folder.checkpoint, folder.previous_checkpoint) if path.exists()]
     if not found:
-        finished = folder.map.exists() and folder.metrics.exists()
-        raise CheckpointError(
-            f"{folder.path} holds no checkpoint: "
-            + ("the run is over" if finished else "start the run again, with --checkpoint-every")
-        )
+        remedy = "start the run again, with --checkpoint-every"
+        if folder.has_results:
+            remedy = f"the run can't go on, but warpslam report {folder.path} makes what is missing of what lies there"
+        raise CheckpointError(f"{folder.path} holds no checkpoint: {remedy}")
     problems = []
     for path in found:
         try:

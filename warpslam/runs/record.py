@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 UNREADABLE = "unreadable"
 FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
 """How a run ended. After ctrl-C everything up to then is written."""
+UNFINISHED = "unfinished"
+"""Figures of a run that has not come to its end, or was ended before it could say how."""
 
 # Beside its number in the sequence; the other fields of a result are in timing.json and trajectory.tum.
 _ROW_FIELDS = ("timestamp", "status", "message", "inliers", "depth_error", "correlation", "covariance", "losses")
