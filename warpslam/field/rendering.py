@@ -57,6 +57,7 @@ def render_image(
         or not 1 <= stride <= max(camera.width, camera.height)
     ):
         raise InputError(f"stride = {stride!r} must be a whole number from 1 to the size of the image")
+    stride = int(stride)
     if depth is None:
         coarse = _render(arrays, camera, T_world_camera, sampling, device, None, stride)
         depth = coarse.depth

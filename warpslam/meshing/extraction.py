@@ -358,8 +358,8 @@ def _check_arguments(
         ("behind_surface", behind, True),
         ("band", 1.0 if band is None else band, False),
     ):
-        if isinstance(value, bool) or not isinstance(value, Real):
-            raise InputError(f"{name} = {value!r} must be a number")
+        if isinstance(value, bool) or not isinstance(value, Real) or abs(value) > 1e300:
+            raise InputError(f"{name} = {value!r} must be a number that is not absurd")
         if not np.isfinite(value) or value < 0 or (value == 0 and not low_ok):
             raise InputError(f"{name} = {value!r} must be a finite number {'of at least' if low_ok else 'above'} 0")
     if not np.isfinite(level_set):
