@@ -64,8 +64,8 @@ class Slam:
         intrinsics: Camera of all frames.
         config: Settings, `Config()` by default.
         device: Warp device, "cpu" or "cuda:0"; by default CUDA where there is one.
-        seed: Of the initial features and of every random choice. Same input, seed and number of CPU cores: same result
-            on the CPU (with the strict schedule).
+        seed: Of the initial features and of every random choice. Same input and seed: same result on the CPU, however
+            many cores it has (with the strict schedule).
         decoders: Decoder weights; by default those of `Config.decoders`, and failing that the package's own.
         timing: When the camera's pixels are taken; `Config.sensor_timing` off = all at once.
     """

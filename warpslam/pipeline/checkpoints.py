@@ -79,8 +79,8 @@ class SavedRun:
         slices = self.state[0].get("slices")
         if slices != slice_count(slam.device):
             log.warning(
-                "the run was started on %s CPU cores and goes on with %d: sums are formed in another order, so the "
-                "result will not be the same to the bit", slices, slice_count(slam.device),
+                "the run was started with WARPSLAM_SLICES=%s and goes on with %d: sums are formed in another order, so "
+                "the result will not be the same to the bit", slices, slice_count(slam.device),
             )  # fmt: skip
         return slam
 

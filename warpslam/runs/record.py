@@ -238,7 +238,7 @@ class Progress:
     """Of the last frame."""
 
     ate_rmse: float | None
-    """ATE RMSE so far, aligned [m]; None without ground truth."""
+    """ATE RMSE so far, aligned [m], asked anew with every twentieth more frames; None without ground truth."""
 
     fps: float
     """Frames a second so far, set-up left out."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from warpslam.runtime.cores import MAX_SLICES
+from warpslam.runtime.cores import MAX_SLICES, thread_count
 
 
 @lru_cache(maxsize=1)
@@ -65,12 +65,21 @@ class Program:
 
 
 def run_slices(commands: list[list[wp.Launch]]) -> None:
-    """Each slice's launches in order, the slices side by side."""
-    first, *others = commands
-    waiting = [_pool().submit(_run_all, part) for part in others]
-    _run_all(first)
+    """Each slice's launches in order, the slices side by side on as many threads as there are cores.
+
+    Which thread runs a slice changes nothing: each has buffers of its own.
+    """
+    threads = min(len(commands), thread_count())
+    mine, *others = (commands[n::threads] for n in range(threads))
+    waiting = [_pool().submit(_run_parts, parts) for parts in others]
+    _run_parts(mine)
     for other in waiting:
         other.result()
+
+
+def _run_parts(parts: list[list[wp.Launch]]) -> None:
+    for part in parts:
+        _run_all(part)
 
 
 _LAUNCH = wp.Launch.launch
