@@ -27,6 +27,7 @@ from warpslam.mapping.scheduler import MappingTask, new_scheduler
 from warpslam.meshing import extract_mesh
 from warpslam.poses import MAX_DISTANCE, check_transform, is_near
 from warpslam.runtime.compilation import compile_kernels
+from warpslam.runtime.environment import named_device
 from warpslam.runtime.exclusive import exclusive
 from warpslam.runtime.launching import synchronize
 from warpslam.runtime.phases import phase
@@ -87,7 +88,7 @@ class Slam:
         check_settings(intrinsics, self.config)
         check_window_fits(intrinsics, self.config.keyframes.max_gigabytes, self.config.mapping.window)
         self.timing = timing
-        self.device = wp.get_device(device)
+        self.device = named_device(device)
         self.seed = seed
         start = time.perf_counter()
         compile_kernels(self.device)

@@ -17,6 +17,7 @@ from warpslam.runs.folder import RunFolder
 from warpslam.runs.metrics import RunMetrics
 from warpslam.runs.request import DEFAULT_METHOD, RunRequest, Source
 from warpslam.runtime.compilation import ModuleProgress, compile_kernels
+from warpslam.runtime.environment import named_device
 from warpslam.runtime.kernel_cache import kernel_cache_errors
 from warpslam.sequences import open_sequence
 from warpslam.slam import Slam
@@ -111,9 +112,7 @@ def check_device(device: str | None) -> None:
         ConfigError: It has not.
     """
     with kernel_cache_errors():
-        names = [str(known) for known in wp.get_devices()]
-    if device is not None and device not in names and not (device == "cuda" and names[1:]):
-        raise ConfigError(f"device {device!r} is not there; this machine has {', '.join(names)}")
+        named_device(device)
 
 
 def check_map(path: str | Path | None) -> None:

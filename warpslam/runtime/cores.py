@@ -28,7 +28,7 @@ def slice_count(device: wp.Device) -> int:
 
 
 def thread_count() -> int:
-    """Threads that run the slices of a launch: the CPU's cores, or fewer if WARPSLAM_THREADS says so. Changes no bit."""
+    """Threads that run the slices of a launch: the CPU's cores, or as few as WARPSLAM_THREADS says. Changes no bit."""
     return max(1, _core_count())
 
 

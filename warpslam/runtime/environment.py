@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import psutil
 
-from warpslam.errors import MapSizeError
+from warpslam.errors import ConfigError, MapSizeError
 
 if TYPE_CHECKING:
     import warp as wp
@@ -60,6 +60,21 @@ def torch_build() -> TorchBuild | None:
 def resident_bytes() -> int:
     """Memory that this process holds."""
     return int(psutil.Process().memory_info().rss)
+
+
+def named_device(name: str | None) -> wp.Device:
+    """The Warp device of a name; its preferred one for None.
+
+    Raises:
+        ConfigError: There is none of that name.
+    """
+    import warp as wp
+
+    known = [str(device) for device in wp.get_devices()]
+    try:
+        return wp.get_device(name)
+    except (RuntimeError, ValueError, TypeError, AttributeError) as error:
+        raise ConfigError(f"device {name!r} is not there; this machine has {', '.join(known)}") from error
 
 
 def free_gigabytes(device: wp.Device) -> float:
