@@ -48,7 +48,7 @@ def as_numbers(values: Any, name: str) -> np.ndarray:
             raise TypeError("complex numbers")
         return array.astype(np.float64, copy=False)
     except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise InputError(f"{name} is no array of numbers ({error})") from error
+        raise InputError(f"{name} is no matrix of numbers ({error})") from error
 
 
 def is_near(T: np.ndarray) -> bool:

@@ -30,7 +30,6 @@ from warpslam.runtime.cores import process_cores
 
 RETRIES = 3
 """How often a sequence is started again after its worker was lost."""
-LOCALHOST = "127.0.0.1"
 _POLL_SECONDS = 0.5
 _MAX_CORES = 8  # more than that a run does not use
 
@@ -61,6 +60,10 @@ def run_on_ray(
         MissingDependencyError: Ray is not installed.
         ConfigError: A setting can't work, or there is no cluster at ``address``.
     """
+    if address == "local":
+        # A cluster of this machine alone listens to this machine alone, unless the environment says otherwise: it is by
+        # this variable, read when Ray is imported, that Ray tells the two apart.
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     try:
         import ray
     except ImportError as error:
@@ -84,8 +87,6 @@ def _connect(ray: Any, address: str) -> None:
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "warning"}
     if address == "local":
         options |= {"address": "local", "num_cpus": len(process_cores()), "include_dashboard": False}
-        # Nobody else is to reach it; without this Ray listens on every interface.
-        options["_node_ip_address"] = LOCALHOST
     else:
         options["address"] = address
     try:
