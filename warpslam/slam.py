@@ -270,7 +270,7 @@ class Slam:
         pose must not end the run.
         """
         pose = None if frame.fault or frame.given_pose is None else self._pose_without_tracking(frame)
-        if pose is None or not (self.config.mapping.enabled and self._is_due(frame)):
+        if pose is None or not self.config.mapping.enabled:
             return frame
         try:
             self.scene.check_growth(*measured_extent(frame.depth, pose, self.intrinsics))

@@ -11,6 +11,7 @@ import selectors
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import traceback
 from collections import Counter
@@ -79,20 +80,21 @@ def attack(name: str, module: str, count: int, *, seed: int = 0, debug: bool = F
         memory_gb: More address space than this beyond what the process has when it starts ends in `MemoryError`.
     """
     account, start, done = Account(name), time.monotonic(), 0
-    while done < count:
-        done = _run_child(
-            account, [name, module, str(seed), str(done), str(count), str(int(debug)), str(memory_gb)], done
-        )
+    with tempfile.TemporaryDirectory(prefix="warpslam-attacks-", ignore_cleanup_errors=True) as folder:
+        while done < count:
+            numbers = (seed, done, count, int(debug), memory_gb)
+            done = _run_child(account, [name, module, *map(str, numbers)], done, folder)
     account.seconds = time.monotonic() - start
     return account
 
 
-def _run_child(account: Account, arguments: list[str], first: int) -> int:
-    """Tries until the child ends; returns the number of the next one."""
+def _run_child(account: Account, arguments: list[str], first: int, folder: str) -> int:
+    """Tries until the child ends; returns the number of the next one. What they write lies in ``folder``."""
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     child = subprocess.Popen(
         [sys.executable, "-m", "tools.attacks.isolation", *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT, start_new_session=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))},
+        env={**os.environ, "TMPDIR": folder, "PYTHONPATH": path},
     )  # fmt: skip
     assert child.stdout is not None and child.stderr is not None
     running, texts, rest = first, b"", b""

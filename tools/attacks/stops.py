@@ -6,6 +6,7 @@ files, and kills itself before a given one. Whatever is left must lead to the by
 
 from __future__ import annotations
 
+import atexit
 import builtins
 import hashlib
 import os
@@ -33,6 +34,7 @@ _THERE = ("metrics.json", "timing.json", "frames.json", "report.html", "panels.p
 def home() -> Path:
     """Folder with the sequence."""
     folder = Path(tempfile.mkdtemp(prefix="warpslam-attacks-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     write_sequence(SyntheticSequence(1, FRAMES, intrinsics=scene.CAMERA), folder / "sequence")
     return folder
 
