@@ -319,8 +319,8 @@ def test_default_folder_and_latest_link(tmp_path):
 
 
 def test_reused_folder_loses_stale_results_only(tmp_path):
-    """A new run removes what an earlier one wrote and nothing else."""
-    for name in ("metrics.json", "mesh.ply", "notes.txt"):
+    """A new run removes what one that came to nothing wrote, and nothing else."""
+    for name in ("metrics.json", "report.html", "notes.txt"):
         (tmp_path / name).write_text("old")
     RunFolder.create(tmp_path, "x")
     assert [file.name for file in tmp_path.iterdir()] == ["notes.txt"]

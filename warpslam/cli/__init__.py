@@ -24,7 +24,10 @@ COMMANDS = {
     "demo": ("run", "SLAM in a small rendered room; needs no data"),
     "batch": ("batch", "run many sequences, and go on where an earlier batch stopped"),
     "bench": ("bench", "the paper's studies on your sequences: tables, plots and a page"),
-    "check": ("check", "whether a folder of RGB-D frames can be used, before a run"),
+    "check": (
+        "check",
+        "whether a folder of RGB-D frames can be used, before a run; or whether that of a run is as the run left it",
+    ),
     "eval": ("evaluate", "trajectory and reconstruction errors of a run"),
     "report": ("report", "HTML report of a run, or a comparison of several"),
     "render": ("render", "a frame beside what the map renders at its pose, as PNG"),

@@ -85,6 +85,7 @@ def run(
     go_on: bool = False,
     check_input: bool = True,
     overwrite: bool = False,
+    discard: bool = False,
 ) -> RunResult:
     """Run SLAM over a sequence and write a run folder.
 
@@ -101,6 +102,7 @@ def run(
             are logged in any case.
         overwrite: ``output`` may hold a run: the new one is written beside it (``next_run`` in its folder) and takes
             its place when it is finished. With ``go_on`` it always may.
+        discard: With ``overwrite``, a run that was stopped while it grew there is given up.
 
     Raises:
         WarpSlamError: The input or a setting can't be used, or a result can't be written. metrics.json is written even
@@ -132,7 +134,7 @@ def run(
                 why_anew = ""
                 break
     if saved is None:
-        folder = RunFolder.create(output, sequence.name, overwrite=overwrite or go_on, discard=go_on)
+        folder = RunFolder.create(output, sequence.name, overwrite=overwrite or go_on, discard=discard or go_on)
     assert folder is not None
     with locked(folder.path), log_file(folder.log, append=saved is not None):
         under_way = Run(request, sequence, folder, truth_mesh, given, observer, saved, check_input)
@@ -412,7 +414,7 @@ class Run:
         self.metrics.error = f"{type(error).__name__}: {error}"
         log.exception("the run failed")
         remove_leftovers(self.folder)
-        if not self.record.results or self.slam is None or self._unwritten is not None:
+        if not self.record.results or self.slam is None:
             return
         if isinstance(error, MapSizeError) and self._makes_map:
             try:

@@ -17,6 +17,7 @@ from warpslam.storage.json_files import read_json, write_json
 
 WRITTEN_FILES = (
     "checkpoint.next.safetensors",
+    "checkpoint.other.safetensors",
     "checkpoint.previous.safetensors",
     "checkpoint.safetensors",
     "config.yaml",
@@ -43,6 +44,7 @@ WRITTEN_FILES = (
 _MARKS_OF_A_RUN = ("metrics.json", "checkpoint.safetensors", "checkpoint.previous.safetensors")
 # A folder without any of these holds nothing that took time to compute.
 _RESULTS = (
+    "checkpoint.other.safetensors",
     "checkpoint.previous.safetensors",
     "checkpoint.safetensors",
     "map.safetensors",
@@ -231,9 +233,18 @@ class RunFolder:
             if now[name] == marks.get(name):
                 (self.path / name).unlink(missing_ok=True)
 
+    def set_checkpoints_aside(self) -> None:
+        """No run goes on from what lies here, but it stays until another run is whole."""
+        other = self.path / "checkpoint.other.safetensors"
+        for path in (self.previous_checkpoint, self.checkpoint):
+            if path.exists():
+                path.replace(other)
+        self.successor.remove_checkpoints()
+
     def remove_checkpoints(self) -> None:
         """Remove what a run could go on from; once it is over, its map holds all that they do."""
-        for path in (self.path / "checkpoint.next.safetensors", self.previous_checkpoint, self.checkpoint):
+        names = ("checkpoint.next.safetensors", "checkpoint.other.safetensors")
+        for path in (*(self.path / name for name in names), self.previous_checkpoint, self.checkpoint):
             path.unlink(missing_ok=True)
 
     def require(self, file: Path, remedy: str) -> Path:
