@@ -23,9 +23,9 @@ from tools.attacks import folders, stops
 from tools.attacks.isolation import Account, attack
 
 
-def _module(module: str, memory_gb: float = 0.0, *, debug: bool = False) -> Callable[[str, int, int], Account]:
+def _module(module: str, memory_gb: float = 0.0, *, build: str = "usual") -> Callable[[str, int, int], Account]:
     def run(name: str, count: int, seed: int) -> Account:
-        return attack(name, f"tools.attacks.{module}", count, seed=seed, memory_gb=memory_gb, debug=debug)
+        return attack(name, f"tools.attacks.{module}", count, seed=seed, memory_gb=memory_gb, build=build)
 
     return run
 
@@ -60,7 +60,8 @@ def _disks(account: Account, count: int, seed: int) -> None:
 
 KINDS: dict[str, tuple[Callable[[str, int, int], Account], int, int]] = {
     "kernels": (_module("kernels"), 2000, 50),
-    "kernels checked": (_module("kernels", debug=True), 500, 10),
+    "kernels checked": (_module("kernels", build="debug"), 500, 10),
+    "kernels from PTX": (_module("kernels", build="ptx"), 100, 3),
     "arguments": (_module("api", 4.0), 1000, 40),
     "frames": (_module("frames"), 5000, 40),
     **{f"folders {name}": (_module("folders", 2.0), 2000, 20) for name in folders.FORMATS},

@@ -68,7 +68,7 @@ class Account:
             self.outcomes[outcome] += 1
 
 
-def attack(name: str, module: str, count: int, *, seed: int = 0, debug: bool = False, memory_gb: float = 0) -> Account:
+def attack(name: str, module: str, count: int, *, seed: int = 0, build: str = "usual", memory_gb: float = 0) -> Account:
     """``count`` tries of ``module.attempt``, or of ``module.prepare()``'s result, in child processes.
 
     Args:
@@ -76,13 +76,14 @@ def attack(name: str, module: str, count: int, *, seed: int = 0, debug: bool = F
         module: Python module.
         count: Tries; each has a random generator of its own, by number.
         seed: Of all of them.
-        debug: Kernels check every access to an array.
+        build: Of the kernels: "usual"; "debug", which checks every access to an array on the CPU; or "ptx", the code
+            for CUDA, whose accesses `tools.gpu.ptx_on_cpu` checks.
         memory_gb: More address space than this beyond what the process has when it starts ends in `MemoryError`.
     """
     account, start, done = Account(name), time.monotonic(), 0
     with tempfile.TemporaryDirectory(prefix="warpslam-attacks-", ignore_cleanup_errors=True) as folder:
         while done < count:
-            numbers = (seed, done, count, int(debug), memory_gb)
+            numbers = (seed, done, count, build, memory_gb)
             done = _run_child(account, [name, module, *map(str, numbers)], done, folder)
     account.seconds = time.monotonic() - start
     return account
@@ -136,17 +137,21 @@ def _run_child(account: Account, arguments: list[str], first: int, folder: str) 
 
 def main() -> None:
     """The child: arguments are those of `attack`."""
-    name, module, seed, first, count, debug, memory_gb = sys.argv[1:]
+    name, module, seed, first, count, build, memory_gb = sys.argv[1:]
     news = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # what anything prints is no news
     import warp as wp
 
-    if debug == "1":
+    if build == "debug":
         wp.config.mode = "debug"
     wp.config.log_level = wp.LOG_ERROR
     from warpslam.errors import WarpSlamError
 
     home = importlib.import_module(module)
+    if build == "ptx":
+        from tools.gpu import ptx_on_cpu
+
+        ptx_on_cpu.install(check=True)
     attempt: Attempt = home.prepare(name) if hasattr(home, "prepare") else home.attempt
     if float(memory_gb):
         pages = int(Path("/proc/self/statm").read_text().split()[0])

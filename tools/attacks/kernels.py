@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
+from tools.attacks.isolation import Attempt
 from tools.attacks.values import numbers
 from warpslam.camera import Intrinsics
 from warpslam.field.arrays import camera_struct, struct
@@ -42,6 +43,12 @@ def scatter(
     ones = Vec32(1.0)
     grid.interpolate_adjoint_features(grad, 0, selected, level.lattice, cell, ones)
     back[tid] = grid.interpolate_adjoint_point(level, cell, ones)
+
+
+def prepare(name: str) -> Attempt:
+    """The first launch compiles, which takes longer than a try may."""
+    attempt(np.random.default_rng(0))
+    return attempt
 
 
 def lattice() -> Lattice:
