@@ -14,7 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from warpslam.config.overrides import merge, parse_override
 from warpslam.config.presets import PRESETS
-from warpslam.errors import ConfigError
+from warpslam.errors import ConfigError, brief
+from warpslam.reading import load_yaml, read_text
 
 _FOLLOW_GIVEN_POSES = ("bundle_adjustment", "depth_start")  # of the mapping group, see `Config.resolved`
 
@@ -443,9 +444,11 @@ class Config(_Group):
             ConfigError: The file can't be read, is no yaml mapping, or a value does not fit.
         """
         try:
-            values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
-            raise ConfigError(f"{path}: can't be read as yaml: {error}") from None
+            values = load_yaml(read_text(path))
+        except OSError as error:
+            raise ConfigError(f"{path}: can't be read ({error.strerror or error})") from None
+        except ValueError as error:
+            raise ConfigError(f"{path}: can't be read as yaml: {brief(error)}") from None
         if not isinstance(values, dict):
             raise ConfigError(f"{path}: expected a mapping of groups, found {type(values).__name__}")
         return cls.from_dict(values, source=str(path))

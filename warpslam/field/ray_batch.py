@@ -32,10 +32,15 @@ from warpslam.kernels.grid import Vec32
 from warpslam.kernels.pixels import Draw, ErrorCells, Images, Pixels
 from warpslam.kernels.samples import Placement, Rays
 from warpslam.runtime.cores import slice_count
+from warpslam.runtime.environment import check_memory
 from warpslam.runtime.launching import Launcher, Step
 
 if TYPE_CHECKING:
     from warpslam.field.objectives import MotionArrays
+
+
+_POINT_BYTES = 72 + 4 * 3 * layout.MASK_WORDS
+"""What a sample takes, without gradients of weights."""
 
 
 class RayBatch:
@@ -48,6 +53,7 @@ class RayBatch:
         self.count = 0
         self.sample_count = 0
         points = capacity * max_samples
+        check_memory(device, _POINT_BYTES * points, f"rays ({capacity}) and samples ({max_samples} each): lower either")
 
         def zeros(shape: int, dtype: Any = float, grad: bool = False) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device, requires_grad=grad)

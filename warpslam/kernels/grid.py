@@ -65,14 +65,14 @@ def find_cell(lattice: Lattice, p: wp.vec3) -> Cell:
         last = lattice.shape[axis] - 1
         x = u[axis]
         free = float(1.0)
-        # Border padding; the gradient along a clamped axis is zero (grid_sample's rule).
-        if x <= 0.0:
+        # Border padding; the gradient along a clamped axis is zero (grid_sample's rule). NaN is clamped, too.
+        if not (x > 0.0):
             x = float(0.0)
             free = float(0.0)
         if x >= float(last):
             x = float(last)
             free = float(0.0)
-        low = wp.min(int(x), last - 1)
+        low = wp.clamp(int(x), 0, last - 1)  # whatever comes in, no index leaves the grid
         cell.corner[axis] = low
         cell.offset[axis] = x - float(low)
         cell.free[axis] = free

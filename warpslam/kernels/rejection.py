@@ -6,6 +6,9 @@ from warpslam.kernels.grid import Lattice, find_cell, row_of
 from warpslam.kernels.pixels import MODULE, Camera, Images, measured, nearest_pixel
 from warpslam.kernels.samples import Rays
 
+MAX_STEPS = wp.constant(1 << 16)
+"""Places at which a ray is looked at, at most."""
+
 
 @wp.func
 def least_and_largest_depth(images: Images, slot: int, pixel: wp.vec2i) -> wp.vec2:
@@ -62,7 +65,7 @@ def drop_contradicted(
     tid = wp.tid()
     if keep[tid] == 0 or frame[tid] >= current or depth[tid] <= 0.0:
         return
-    count = int(depth[tid] / (0.5 * margin)) + 1
+    count = wp.clamp(int(depth[tid] / (0.5 * margin)), 0, MAX_STEPS) + 1
     for n in range(count):
         # The last one is the point that was measured.
         z = depth[tid] * float(n + 1) / float(count)

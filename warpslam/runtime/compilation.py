@@ -18,6 +18,7 @@ import warp as wp
 
 from warpslam.errors import ConfigError
 from warpslam.runtime.cores import process_cores
+from warpslam.runtime.kernel_cache import check_room
 
 _STAGES = (
     "rays",
@@ -136,6 +137,8 @@ def _each(
         with lock:
             if report is not None:
                 report(ModuleProgress(name, len(finished), len(names), compiled=not before))
+        if not before:
+            check_room()
         start = time.perf_counter()
         build(module)
         seconds = time.perf_counter() - start
