@@ -213,8 +213,8 @@ def test_overlapped_run_goes_on_with_a_weaker_promise(recording, tmp_path, capsy
 
 def test_nothing_to_resume_is_said(uninterrupted, tmp_path, capsys):
     """A run that is over, and a folder without any run."""
-    assert cli.main(["run", "--resume", str(uninterrupted)]) == 2
-    assert "the run is over" in capsys.readouterr().err
+    assert cli.main(["run", "--resume", str(uninterrupted)]) == 0
+    assert "nothing to do" in capsys.readouterr().out
     assert cli.main(["run", "--resume", str(tmp_path)]) == 2
     assert "--checkpoint-every" in capsys.readouterr().err
 
