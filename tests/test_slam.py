@@ -408,3 +408,31 @@ def test_unusable_map_file(frames, tmp_path):
     np.savez(path, something=np.zeros(3))
     with pytest.raises(CheckpointError, match="map.safetensors"):
         Slam.load(path)
+
+
+def test_a_pose_far_away_costs_one_frame():
+    """A given pose 500 km away, or one from where the map has no room for what is seen, skips its frame: the map is as
+    it was, and the frames after it are OK.
+    """
+    sequence = SyntheticSequence(1, 4, intrinsics=CAMERA)
+    slam = new_slam("tracking.use_given_poses=true", "grid.max_gigabytes=0.2")
+    frame = sequence[0]
+    slam.step(frame.rgb, frame.depth, 0.0, frame.T_world_camera)
+    bounds, features = slam.scene.bounds, slam.scene.grids["fine"].features.numpy().copy()
+    for n, metres in enumerate((5e5, 1e38, 9e3)):
+        frame = sequence[2]
+        far = frame.T_world_camera.copy()
+        far[:3, 3] += metres
+        result = slam.step(frame.rgb, frame.depth, 1.0 + n, far)
+        assert result.status == "SKIPPED" and "T_world_camera" in result.message
+        np.testing.assert_array_equal(slam.scene.bounds, bounds)
+        np.testing.assert_array_equal(slam.scene.grids["fine"].features.numpy(), features)
+    frame = sequence[2]
+    assert slam.step(frame.rgb, frame.depth, 9.0, frame.T_world_camera).status == "OK"
+
+
+@pytest.mark.parametrize("device", ["cuda:7", "gpu", 3, "cuda" if not wp.get_cuda_devices() else "cuda:9"])
+def test_a_device_that_is_not_there_is_a_config_error(device):
+    """By whatever name."""
+    with pytest.raises(ConfigError, match="this machine has"):
+        Slam(CAMERA, device=device)

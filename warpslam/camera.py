@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from numbers import Real
 
 import numpy as np
 
 from warpslam.errors import ConfigError, InputError
+
+MAX_IMAGE_SIZE = 16384
+"""Largest width and height of an image [px]: what OpenCV warps without trouble."""
+MIN_FOCAL, MAX_PIXELS = 1e-2, 1e7
+"""Least focal length, and largest one and coordinate of a principal point [px]."""
 
 
 @dataclass(frozen=True)
@@ -27,13 +33,31 @@ class Intrinsics:
     """Rows of the image."""
 
     def __post_init__(self) -> None:
+        for name in ("fx", "fy", "cx", "cy", "width", "height"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, Real):
+                raise ConfigError(f"camera.{name} = {value!r} must be a number")
         for name in ("fx", "fy", "width", "height"):
             value = getattr(self, name)
             if not np.isfinite(value) or value <= 0:
                 raise ConfigError(f"camera.{name} = {value!r} must be a positive number")
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if value != int(value) or value > MAX_IMAGE_SIZE:
+                raise ConfigError(
+                    f"camera.{name} = {value!r} must be a whole number of at most {MAX_IMAGE_SIZE} pixels"
+                )
+            object.__setattr__(self, name, int(value))
+        for name in ("fx", "fy"):
+            if not MIN_FOCAL <= getattr(self, name) <= MAX_PIXELS:
+                raise ConfigError(
+                    f"camera.{name} = {getattr(self, name)!r} must be {MIN_FOCAL:g} to {MAX_PIXELS:g} pixels"
+                )
         for name in ("cx", "cy"):
-            if not np.isfinite(getattr(self, name)):
-                raise ConfigError(f"camera.{name} = {getattr(self, name)!r} must be finite")
+            if not abs(getattr(self, name)) <= MAX_PIXELS:  # NaN is not
+                raise ConfigError(
+                    f"camera.{name} = {getattr(self, name)!r} must be finite, at most {MAX_PIXELS:g} pixels"
+                )
 
     @property
     def matrix(self) -> np.ndarray:
@@ -120,6 +144,11 @@ class TimingChange:
         return self.depth_delay == 0.0 and self.readout == 0.0
 
 
+MAX_TWIST = 1e3
+"""No camera moves faster, [m/s] and [rad/s]."""
+MAX_DEPTH_OFFSET = 0.5
+"""Depth is taken within this time [s] of its colour image, by the stamps."""
+
 ONE_MOMENT = SensorTiming()
 """All pixels of a frame are taken at once."""
 
@@ -147,6 +176,15 @@ class FrameMotion:
     def retimed(self, change: TimingChange) -> FrameMotion:
         """The same frame, taken by a camera of another timing."""
         return replace(self, depth_offset=self.depth_offset + change.depth_delay, readout=self.readout + change.readout)
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether a camera can have moved so: what a file says must be."""
+        return (
+            bool((np.abs(self.twist) <= MAX_TWIST).all())
+            and abs(self.depth_offset) <= MAX_DEPTH_OFFSET + MAX_DEPTH_DELAY
+            and 0 <= self.readout <= MAX_READOUT
+        )
 
     def to_array(self) -> np.ndarray:
         """Twist, depth_offset and readout, float64 (8,)."""

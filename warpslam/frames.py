@@ -14,17 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from warpslam.camera import ONE_MOMENT, Intrinsics, SensorTiming, check_number
+from warpslam.camera import MAX_DEPTH_OFFSET, ONE_MOMENT, Intrinsics, SensorTiming, check_number
 from warpslam.config import Config
 from warpslam.errors import ConfigError, FrameError, InputError
-from warpslam.poses import check_transform, orthonormalized
+from warpslam.poses import MAX_DISTANCE, check_transform, is_near, orthonormalized
 
 MIN_DEPTH_PIXELS = 100
 BLANK_SHARE = 0.99
 """An image is black or over-exposed if this share of its pixels is."""
 DARKEST, BRIGHTEST = 2, 253
-MAX_DEPTH_OFFSET = 0.5
-"""Depth is taken within this time [s] of its colour image."""
 DEFAULT_RATE = 30.0
 """Frames a second where no times are given."""
 
@@ -163,6 +161,10 @@ def admit(
             if needs_pose:
                 raise FrameError("its T_world_camera holds NaN or infinity, and tracking.use_given_poses is on")
             given = None
+        if given is not None and not is_near(given):
+            raise FrameError(
+                f"its T_world_camera is farther than {MAX_DISTANCE:g} m from the origin; shift the origin of the poses"
+            )
     except FrameError as error:
         time = time if math.isfinite(time) else last_timestamp
         nothing = np.zeros((0, 0, 3), np.uint8), np.zeros((0, 0), np.float32)
@@ -271,8 +273,8 @@ def _metres(depth: np.ndarray, depth_scale: float | None, max_depth: float) -> n
     with np.errstate(over="ignore"):
         depth = depth.astype(np.float32, copy=False)
     usable = (depth > 0) & (depth <= max_depth)  # NaN is neither
-    if not math.isfinite(max_depth):
-        usable &= np.isfinite(depth)
+    if max_depth > MAX_DISTANCE:
+        usable &= depth <= MAX_DISTANCE
     count = np.count_nonzero(usable)
     if count < MIN_DEPTH_PIXELS:
         within = f" within {max_depth:g} m" if math.isfinite(max_depth) else ""

@@ -12,16 +12,16 @@ import numpy as np
 
 from warpslam.errors import InputError
 
+MAX_DISTANCE = 1e4
+"""Nothing lies farther from the origin, on any axis [m]: beyond it float32 can't tell two millimetres apart."""
+
 
 def check_transform(T: np.ndarray, name: str = "T_world_camera", *, unknown_is_nan: bool = False) -> np.ndarray:
-    """Return ``T`` as a float64 (4, 4) rigid transform or raise `InputError`.
+    """Return ``T`` as a float64 (4, 4) rigid transform or raise `InputError`; `is_near` tells whether it is near.
 
     unknown_is_nan: A matrix that is not finite stands for an unknown pose and is returned as it is.
     """
-    try:
-        T = np.asarray(T, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is no matrix of numbers ({error})") from error
+    T = as_numbers(T, name)
     if T.shape != (4, 4):
         raise InputError(f"{name} has shape {T.shape}, expected (4, 4)")
     if not np.isfinite(T).all():
@@ -31,7 +31,39 @@ def check_transform(T: np.ndarray, name: str = "T_world_camera", *, unknown_is_n
     R = T[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
         raise InputError(f"{name} has no rotation in its upper left 3x3 block (not orthonormal, or a reflection)")
+    if np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
+        raise InputError(f"{name} has {T[3].tolist()} as its last row, expected 0 0 0 1: is it transposed?")
     return T
+
+
+def as_numbers(values: Any, name: str) -> np.ndarray:
+    """An array of real numbers, float64, of what NumPy, torch or Warp hold; or raise `InputError`."""
+    try:
+        if hasattr(values, "detach"):  # a tensor that is part of a gradient, or on a GPU
+            values = values.detach().cpu().numpy()
+        elif hasattr(values, "numpy"):
+            values = values.numpy()
+        array = np.asarray(values)
+        if np.iscomplexobj(array):
+            raise TypeError("complex numbers")
+        return array.astype(np.float64, copy=False)
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise InputError(f"{name} is no matrix of numbers ({error})") from error
+
+
+def is_near(T: np.ndarray) -> bool:
+    """Whether the translation of a transform (4, 4), or of all of a stack (N, 4, 4), is within `MAX_DISTANCE`."""
+    return bool((np.abs(T[..., :3, 3]) <= MAX_DISTANCE).all())  # NaN is not
+
+
+def are_rigid(T: np.ndarray) -> bool:
+    """Whether all of a stack (N, 4, 4) are finite rigid transforms within `MAX_DISTANCE`."""
+    if not (np.isfinite(T).all() and is_near(T)):
+        return False
+    R = T[:, :3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        is_rotation = np.abs(R @ R.swapaxes(1, 2) - np.eye(3)).max(initial=0.0) <= 1e-2 and (np.linalg.det(R) > 0).all()
+    return bool(is_rotation and (np.abs(T[:, 3] - [0.0, 0.0, 0.0, 1.0]) <= 1e-6).all())
 
 
 def orthonormalized(T: np.ndarray) -> np.ndarray:

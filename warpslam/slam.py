@@ -15,7 +15,7 @@ import warp as wp
 
 from warpslam.camera import ONE_MOMENT, FrameMotion, Intrinsics, SensorTiming
 from warpslam.config import Config
-from warpslam.errors import InputError
+from warpslam.errors import InputError, MapSizeError
 from warpslam.field.complexity import field_flops, weight_count
 from warpslam.field.decoder_files import load_decoders
 from warpslam.field.decoders import Decoders
@@ -23,11 +23,13 @@ from warpslam.field.rendering import RenderedImage, render_image
 from warpslam.frames import AdmittedFrame, FrameResult, FrameStatus, admit, check_settings, skipped
 from warpslam.loops.closer import LoopCloser
 from warpslam.mapping.frustum import measured_extent
-from warpslam.mapping.mapper import Mapper
+from warpslam.mapping.policy import new_mapper
 from warpslam.mapping.scheduler import MappingTask, new_scheduler
 from warpslam.meshing import extract_mesh
-from warpslam.poses import check_transform
+from warpslam.poses import MAX_DISTANCE, check_transform, is_near
 from warpslam.runtime.compilation import compile_kernels
+from warpslam.runtime.environment import named_device
+from warpslam.runtime.exclusive import exclusive
 from warpslam.runtime.launching import synchronize
 from warpslam.runtime.phases import phase
 from warpslam.scene.image_pool import ImagePool, check_window_fits
@@ -58,12 +60,15 @@ class Slam:
     Its parts: ``scene`` (the map), ``history`` (what became of every frame), ``keyframes``, ``images`` (theirs, and the
     current frame's), ``direct`` (or ``tracker`` and ``localizer``), ``mapper`` and ``scheduler``.
 
+    Several threads may use one object: each call waits for the one before. A forked process may go on with it where it
+    is on the CPU with the strict schedule; else it gets an `InputError`.
+
     Args:
         intrinsics: Camera of all frames.
         config: Settings, `Config()` by default.
         device: Warp device, "cpu" or "cuda:0"; by default CUDA where there is one.
-        seed: Of the initial features and of every random choice. Same input, seed and number of CPU cores: same result
-            on the CPU (with the strict schedule).
+        seed: Of the initial features and of every random choice. Same input and seed: same result on the CPU, however
+            many cores it has (with the strict schedule).
         decoders: Decoder weights; by default those of `Config.decoders`, and failing that the package's own.
         timing: When the camera's pixels are taken; `Config.sensor_timing` off = all at once. Where none is known it is
             estimated from frames whose depth has stamps of its own (`DirectConfig.timing`), and is then that.
@@ -86,7 +91,7 @@ class Slam:
         check_settings(intrinsics, self.config)
         check_window_fits(intrinsics, self.config.keyframes.max_gigabytes, self.config.mapping.window)
         self.timing = timing
-        self.device = wp.get_device(device)
+        self.device = named_device(device)
         self.seed = seed
         start = time.perf_counter()
         compile_kernels(self.device)
@@ -97,18 +102,21 @@ class Slam:
         self.images = ImagePool(intrinsics, self.device, self.config.keyframes.max_gigabytes)
         self.tracker = Tracker(intrinsics, self.config.tracking, self.config.sampling, self.device, seed)
         self.localizer = Localizer(self.tracker, self.config.tracking, intrinsics)
-        self.mapper = Mapper(self.scene, intrinsics, self.config.mapping, self.config.sampling, self.device, seed)
+        self.mapper = new_mapper(self.scene, intrinsics, self.config, self.device, seed)
         self.direct = self._direct_tracker()
         self.loops = self._loop_closer()
         self.timing_estimator = self._timing_estimator()
         self.scheduler = new_scheduler(self.config.schedule, self.mapper, self.images)
         self._seen: list[SeenDepth] = []
+        self.lock = self.scene.lock
+        self.lock.outlives_fork &= self.config.schedule == "strict"
         self._digest: int | None = None
         self._current: int | None = None
         self._mapped: int | None = None
 
     # -- the algorithm -------------------------------------------------------------------------------------------
 
+    @exclusive
     def step(
         self,
         rgb: Any,
@@ -134,7 +142,8 @@ class Slam:
 
         A bad frame raises nothing: arrays of another size or type, too few pixels with depth, a black or over-exposed
         image, a time that is not finite, depth stamped more than half a second from colour, or a pose that is not
-        finite where one is needed give the status SKIPPED and a message, and leave the map as it was.
+        finite where one is needed, farther than 10 km from the origin, or from where the map has no room for what is
+        seen, give the status SKIPPED and a message, and leave the map as it was.
 
         Raises:
             InputError: Misuse, which no other frame would mend: an argument that is no array, integer depth without
@@ -145,6 +154,7 @@ class Slam:
         digest = self._digest
         if self.direct is not None and not frame.fault:
             frame, digest = self._check_new(frame)
+        frame = self._check_growth(frame)
         if frame.fault:
             self.history.skip(frame.timestamp)
             return skipped(frame, self.history.last_pose)
@@ -165,6 +175,7 @@ class Slam:
                 self._insert_keyframe(frame, account)
         return replace(self._result(frame, located, account), sensor_timing=found)
 
+    @exclusive
     def finish(self) -> dict[str, float]:
         """After the last frame: map it if it was not, then refine the whole map (Sec. 3.1). Returns the seconds by
         phase.
@@ -187,6 +198,7 @@ class Slam:
                 self._refine(index, 0, self.config.mapping.refinement_rounds)
         return account.seconds
 
+    @exclusive
     def refine(self, rounds: int | None = None) -> None:
         """More rounds of the global refinement that `finish` ends with (Sec. 3.1), on a map that is done.
 
@@ -203,10 +215,12 @@ class Slam:
         done = config.refinement_rounds if config.color_refinement else 0
         self._refine(index, done, config.refinement_rounds if rounds is None else rounds)
 
+    @exclusive
     def wait(self) -> None:
         """Until every frame that was to be mapped is in the map (at once, unless `Config.schedule` is overlapped)."""
         self._take_over(wait=True)
 
+    @exclusive
     def forget_pose(self) -> None:
         """The camera may be anywhere now: the next frame takes the pose that comes with it, or is looked for at the
         keyframes.
@@ -270,6 +284,29 @@ class Slam:
             frame = replace(frame, fault="its images are those of the frame before, to the bit")
         return frame, digest
 
+    def _check_growth(self, frame: AdmittedFrame) -> AdmittedFrame:
+        """The frame, with a fault if the map has no room for what it sees from the pose that it comes with: one wrong
+        pose must not end the run.
+        """
+        pose = None if frame.fault or frame.given_pose is None else self._pose_without_tracking(frame)
+        if pose is None or not self.config.mapping.enabled:
+            return frame
+        try:
+            self.scene.check_growth(*measured_extent(frame.depth, pose, self.intrinsics))
+        except MapSizeError as error:
+            if self.scene.is_empty:
+                raise  # no pose is to blame
+            return replace(frame, fault=f"from its T_world_camera {error}")
+        return frame
+
+    def _pose_without_tracking(self, frame: AdmittedFrame) -> np.ndarray | None:
+        """The pose that is given, or the origin, where there is nothing to track by; None where there is."""
+        given = frame.given_pose
+        is_starting = self.history.last_known is None and (given is not None or not self._has_begun)
+        if self.config.tracking.use_given_poses or is_starting:
+            return np.eye(4) if given is None else given
+        return None
+
     def _is_due(self, frame: AdmittedFrame) -> bool:
         return self.scene.is_empty or frame.index % self.config.mapping.every == 0
 
@@ -288,10 +325,8 @@ class Slam:
 
     def _locate(self, frame: AdmittedFrame, account: _Account) -> Located:
         """Where the camera is: tracked against the map; given, or the origin, where there is nothing to track by."""
-        given = frame.given_pose
-        is_starting = self.history.last_known is None and (given is not None or not self._has_begun)
-        if self.config.tracking.use_given_poses or is_starting:
-            pose = np.eye(4) if given is None else given
+        pose = self._pose_without_tracking(frame)
+        if pose is not None:
             if self.direct is not None:
                 with account.timed("tracking"):
                     self.direct.place(frame, pose)
@@ -428,27 +463,34 @@ class Slam:
         return self.timing if self.config.sensor_timing else ONE_MOMENT
 
     @property
+    @exclusive
     def trajectory(self) -> Trajectory:
         """All poses so far; keyframes and mapped frames with the corrections of bundle adjustment."""
         return self.history.trajectory
 
     @property
+    @exclusive
     def views(self) -> list[ObservedView]:
         """What the mapped frames saw, from the poses that they have by now."""
         return [seen.view(self.intrinsics, self.history.pose(seen.index)) for seen in self._seen]
 
+    @exclusive
     def render(self, T_world_camera: np.ndarray, *, depth: np.ndarray | None = None, stride: int = 1) -> RenderedImage:
         """View of the map from a pose, every ``stride``-th pixel; a ``depth`` image [m] guides the samples if given.
 
         Raises:
-            InputError: The map is empty, or the pose is no rigid transform.
+            InputError: The map is empty, the pose is no rigid transform or farther than 10 km from the origin, or
+                ``depth`` or ``stride`` do not fit the camera.
         """
         if self.scene.is_empty:
             raise InputError("the map is empty: step at least one frame first")
         T = check_transform(T_world_camera)
+        if not is_near(T):
+            raise InputError(f"T_world_camera lies farther than {MAX_DISTANCE:g} m from the origin")
         arrays = self.scene.arrays()
         return render_image(arrays, self.intrinsics, T, self.config.sampling, self.device, depth=depth, stride=stride)
 
+    @exclusive
     def mesh(self, voxel: float | None = None, *, forecast: bool = False) -> trimesh.Trimesh:
         """Coloured mesh of what the mapped frames saw (A.4), in the world frame.
 
@@ -458,13 +500,14 @@ class Slam:
 
         Raises:
             MeshError: Nothing was seen, or there is no surface.
+            InputError: ``voxel`` is no positive number, or so small that the mesh would take too much time or memory.
         """
         self.wait()
         config = self.config.meshing
         return extract_mesh(
             self.scene,
             self.views,
-            voxel=voxel or config.voxel,
+            voxel=config.voxel if voxel is None else voxel,
             level_set=config.level_set,
             min_component_area=config.min_component_area,
             forecast=forecast,
@@ -483,6 +526,7 @@ class Slam:
         """Operations of the field at a point, forward (see `warpslam.field.complexity`)."""
         return field_flops({decoder.level: decoder.hidden for decoder in self.scene.decoder_weights})["field"]
 
+    @exclusive
     def inventory(self) -> dict[str, Any]:
         """Figures of the map for metrics.json; see `warpslam.scene.inventory.take_inventory`."""
         found = take_inventory(self.scene, self.images, self.keyframes, self._seen, self.views)
@@ -490,6 +534,7 @@ class Slam:
 
     # -- saved ---------------------------------------------------------------------------------------------------
 
+    @exclusive
     def save(self, path: str | Path) -> None:
         """Write map, keyframes, trajectory and settings to one file (plain arrays, no code).
 
@@ -529,6 +574,7 @@ class Slam:
             slam.forget_pose()
         return slam
 
+    @exclusive
     def state(self) -> SlamState:
         """All that the next frame depends on; on the CPU the large arrays are those of the map, not copies."""
         self.wait()
@@ -550,6 +596,7 @@ class Slam:
             digest=self._digest,
             timing_state=None if self.timing_estimator is None else self.timing_estimator.state(),
             loops=None if self.loops is None else self.loops.state(),
+            optimizer=self.mapper.state(),
         )
 
     @classmethod
@@ -566,6 +613,7 @@ class Slam:
         slam = cls(state.intrinsics, config, device, state.seed, decoders=state.scene.decoders, timing=state.timing)
         slam.history = FrameHistory.restored(state.history)
         slam.scene.restore(state.scene)
+        slam.mapper.restore(state.optimizer)
         images = [image for _, image in state.keyframes]
         slam.images.restore(state.current_image, state.current_motion, images)
         slam.keyframes = [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +16,22 @@ from warpslam.config import Config
 from warpslam.errors import ConfigError, InputError
 from warpslam.field.decoders import LEVELS, Decoders, DecoderWeights, expected_shapes
 from warpslam.frames import check_settings
+from warpslam.kernels.decoder.layout import COLOR_WEIGHT_ROWS
 from warpslam.loops.closer import LoopFigures, LoopState
+from warpslam.poses import MAX_DISTANCE, are_rigid
 from warpslam.runtime.cores import slice_count
 from warpslam.scene.feature_grid import GridState
 from warpslam.scene.image_pool import CompactImage
 from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
 from warpslam.scene.scene_map import SceneState
+from warpslam.scene.touched_rows import TouchedRowsState
 from warpslam.storage.state_file import StateFields, StateFormat, read_state, write_state
 from warpslam.tracking.direct.timing import TimingState
 from warpslam.tracking.direct.tracker import DirectState
 from warpslam.trajectory import HistoryState
 
-MAP_FORMAT = StateFormat("warpslam-map", 6, "the map of a run with --method nice-slam")
+MAP_FORMAT = StateFormat("warpslam-map", 7, "the map of a run with --method nice-slam")
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,8 @@ class SlamState:
     """What the estimate of the camera's timing goes on from."""
     loops: LoopState | None = None
     """What the search for loops goes on from."""
+    optimizer: dict[str, TouchedRowsState] = field(default_factory=dict)
+    """What mapping keeps of rows that were updated, by level."""
 
 
 def write_slam(path: Path, state: SlamState) -> None:
@@ -121,6 +126,7 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
         "seen": [seen.index for seen in state.seen],
         "direct": None if state.direct is None else _direct_header(state.direct),
         "timing_estimate": None if state.timing_state is None else _timing_header(state.timing_state),
+        "optimizer": list(state.optimizer),
     }
     if state.loops is not None:
         header["loops"] = {"seen": state.loops.seen, "figures": state.loops.figures}
@@ -153,6 +159,10 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
         arrays[f"grid_{level}_shape"] = np.array(grid.shape, np.int64)
         arrays[f"grid_{level}"] = grid.features
         arrays[f"grid_{level}_seen"] = grid.seen
+    for level, rows in state.optimizer.items():
+        arrays[f"optimizer_{level}_rows"] = rows.rows
+        arrays[f"optimizer_{level}_updates"] = rows.updates
+        arrays[f"optimizer_{level}_moments"] = rows.moments
     for weights in state.scene.decoders:
         for name, tensor in weights.tensors.items():
             arrays[f"decoder_{weights.level}:{name}"] = tensor
@@ -188,17 +198,24 @@ def state_from_arrays(
     history = HistoryState.read(fields)
     count = len(history.poses)
     size = (camera.height, camera.width)
+    # Of the size that the camera says, before anything else is unpacked to that size.
+    rgb, depth = fields.array("current_rgb", np.uint8, (*size, 3)), fields.array("current_depth", np.uint16, size)
     frames = fields.frames("keyframes", count)
-    scales = fields.array("image_scales", np.float64, (len(frames) + 1,)).tolist()
+    scales = _within(fields, "image_scales", (len(frames) + 1,), 0.0, 1.0).tolist()
     images = [_image(fields, n, scales[n + 1], camera) for n in range(len(frames))]
-    poses = fields.array("keyframe_poses", np.float64, (len(frames), 4, 4)).copy()
-    motions = [FrameMotion.from_array(one) for one in fields.array("motions", np.float64, (len(frames) + 1, 8))]
+    poses = fields.poses("keyframe_poses", len(frames)).copy()
+    motions = [_motion(fields, "motions", one) for one in fields.array("motions", np.float64, (len(frames) + 1, 8))]
     keyframes = [Keyframe(index, n, poses[n], motions[n + 1]) for n, index in enumerate(frames)]
     seen = fields.frames("seen", count)
     depths = fields.array("seen", np.uint16, (len(seen), *_seen_size(camera)))
-    rgb, depth = fields.array("current_rgb", np.uint8, (*size, 3)), fields.array("current_depth", np.uint16, size)
-    low, high = fields.array("bounds", np.float64, (2, 3)).copy()
+    low, high = _within(fields, "bounds", (2, 3), -2 * MAX_DISTANCE, 2 * MAX_DISTANCE).copy()
+    grids = {level: _grid(fields, level, getattr(saved.grid, f"{level}_spacing"), low, high) for level in LEVELS}
+    if len({0 in grid.shape for grid in grids.values()}) > 1:
+        raise fields.damaged("grid_middle_shape", "some levels are empty, and some are not")
     decoders = Decoders(*(_decoder(fields, level) for level in LEVELS))
+    digest = fields.header.get("digest")
+    if digest is not None:
+        digest = fields.integer("digest")
     return SlamState(
         config=config,
         intrinsics=camera,
@@ -206,7 +223,7 @@ def state_from_arrays(
         seed=fields.integer("seed"),
         device=wp.get_device("cpu"),
         history=history,
-        scene=SceneState(decoders, low, high, {level: _grid(fields, level) for level in LEVELS}),
+        scene=SceneState(decoders, low, high, grids),
         current_image=(rgb, depth, scales[0]),
         current_motion=motions[0],
         keyframes=list(zip(keyframes, images, strict=True)),
@@ -214,9 +231,10 @@ def state_from_arrays(
         current=fields.frame("current", count),
         mapped=fields.frame("mapped", count),
         direct=_direct(fields, count, len(frames)),
-        digest=fields.header.get("digest"),
+        digest=digest,
         timing_state=_timing_state(fields, count),
         loops=_loops(fields, len(frames)),
+        optimizer=_optimizer(fields),
     )
 
 
@@ -227,15 +245,56 @@ def _config(fields: StateFields) -> Config:
         raise fields.damaged("config", error) from None
 
 
-def _grid(fields: StateFields, level: str) -> GridState:
-    nx, ny, nz = fields.array(f"grid_{level}_shape", np.int64, (3,)).tolist()
+def _within(fields: StateFields, name: str, shape: tuple[int, ...], least: float, most: float) -> np.ndarray:
+    array = fields.array(name, np.float64, shape)
+    if ((array < least) | (array > most)).any():
+        raise fields.damaged(name, f"it holds {array.min():g} to {array.max():g}, expected {least:g} to {most:g}")
+    return array
+
+
+def _motion(fields: StateFields, name: str, values: np.ndarray) -> FrameMotion:
+    motion = FrameMotion.from_array(values)
+    if not motion.is_possible:
+        raise fields.damaged(name, f"no camera moves so: {motion}")
+    return motion
+
+
+def _grid(fields: StateFields, level: str, spacing: float, low: np.ndarray, high: np.ndarray) -> GridState:
+    shape = fields.array(f"grid_{level}_shape", np.int64, (3,))
+    first = fields.array(f"grid_{level}_first", np.int64, (3,)).copy()
+    nx, ny, nz = shape.tolist()
+    if (nx, ny, nz) != (0, 0, 0):
+        # A cell has two vertices along each axis, and what the map covers lies in its cells.
+        ends = first.astype(float) * spacing, (first.astype(float) + shape - 1) * spacing
+        beyond = max(float((ends[0] - low).max()), float((high - ends[1]).max()))
+        if min(nx, ny, nz) < 2 or beyond > 1e-3 * spacing or np.abs(ends).max() > 3 * MAX_DISTANCE:
+            raise fields.damaged(f"grid_{level}_shape", f"{nx} x {ny} x {nz} from {first.tolist()} on does not fit")
     rows = nx * ny * nz
     return GridState(
-        fields.array(f"grid_{level}_first", np.int64, (3,)).copy(),
+        first,
         (nx, ny, nz),
         fields.array(f"grid_{level}", np.float32, (rows, 32)),
         fields.array(f"grid_{level}_seen", np.uint8, (rows,)),
     )
+
+
+def _optimizer(fields: StateFields) -> dict[str, TouchedRowsState]:
+    levels = fields.header.get("optimizer")
+    if not isinstance(levels, list) or not set(levels) <= {*LEVELS, "decoder"}:
+        raise fields.damaged("optimizer", f"{levels!r} are no levels")
+    result = {}
+    for level in levels:
+        is_grid = level != "decoder"
+        total = int(np.prod(fields.array(f"grid_{level}_shape", np.int64, (3,)))) if is_grid else COLOR_WEIGHT_ROWS
+        rows = fields.array(f"optimizer_{level}_rows", np.int32, (None if is_grid else total,))
+        if len(rows) and (rows[0] < 0 or rows[-1] >= total or (np.diff(rows) <= 0).any()):
+            raise fields.damaged(f"optimizer_{level}_rows", f"not ascending rows below {total}")
+        result[level] = TouchedRowsState(
+            rows,
+            fields.array(f"optimizer_{level}_updates", np.int32, (len(rows),)),
+            fields.array(f"optimizer_{level}_moments", np.float32, (len(rows), 2, 32)),
+        )
+    return result
 
 
 def _image(fields: StateFields, n: int, scale: float, camera: Intrinsics) -> CompactImage:
@@ -275,17 +334,26 @@ def _direct(fields: StateFields, frames: int, keyframes: int) -> DirectState | N
         scale, cost = (np.inf if header[name] is None else float(header[name]) for name in ("scale", "cost"))
     except (KeyError, TypeError, ValueError) as error:
         raise fields.damaged("direct", error) from None
+    relative = fields.array("direct_relative", np.float64, (count, 4, 4)).copy()
+    found = fields.array("direct_found", np.float64, (2, 4, 4)).copy()
+    if not are_rigid(relative[anchors >= 0]) or (confirmed > 0 and not are_rigid(found)):
+        raise fields.damaged("direct_relative or direct_found", "they are no rigid transforms of a camera")
+    learnt = (depth_sigma, scale, cost)
+    if not all(0 <= value for value in learnt) or not np.isfinite(depth_sigma) or confirmed < 0:
+        raise fields.damaged("direct", f"depth_sigma, scale and cost {learnt}, confirmed {confirmed}")
+    motion = fields.array("direct_motion", np.float64, (8,)).copy()
+    _motion(fields, "direct_motion", motion)
     if not (0 <= reference < max(keyframes, 1) and -1 <= before < frames):
         raise fields.damaged("direct", f"reference {reference} of {keyframes}, frame {before} of {frames}")
     return DirectState(
         anchors=anchors.copy(),
-        relative=fields.array("direct_relative", np.float64, (count, 4, 4)).copy(),
+        relative=relative,
         overlap=fields.array("direct_overlap", np.float64, (keyframes,)).copy(),
         reference=reference,
         before=before,
-        found=fields.array("direct_found", np.float64, (2, 4, 4)).copy(),
+        found=found,
         confirmed=confirmed,
-        motion=fields.array("direct_motion", np.float64, (8,)).copy(),
+        motion=motion,
         depth_sigma=depth_sigma,
         typical=(scale, cost),
     )

@@ -12,7 +12,7 @@ from itertools import islice
 import numpy as np
 
 from warpslam.frames import FrameStatus
-from warpslam.poses import inverse, motion_between, twist_of
+from warpslam.poses import are_rigid, inverse, motion_between, twist_of
 from warpslam.storage.state_file import StateFields
 
 RECENT_FRAMES = 20
@@ -94,18 +94,24 @@ class HistoryState:
         Raises:
             CheckpointError: A field is missing or damaged.
         """
-        poses = fields.array("poses", np.float64, (None, 4, 4))
+        poses = fields.poses("poses", None)
         count = len(poses)
         status = fields.array("status", np.uint8, (count,))
         if (status >= len(FrameStatus)).any():
             raise fields.damaged("status", f"codes beyond {len(FrameStatus) - 1}")
+        motion = fields.array("motion", np.float64, (4, 4))
+        if not are_rigid(motion[None]):
+            raise fields.damaged("motion", "it is no rigid transform of a camera")
+        first = fields.integer("first")
+        if first > count:
+            raise fields.damaged("first", f"{first} is beyond the {count} frames")
         return cls(
             timestamps=fields.array("timestamps", np.float64, (count,)),
             poses=poses,
             status=status,
             depth_errors=fields.array("depth_errors", np.float64, (count,)),
-            motion=fields.array("motion", np.float64, (4, 4)),
-            first=fields.integer("first"),
+            motion=motion,
+            first=first,
         )
 
 

@@ -92,8 +92,8 @@ class Iteration:
         self.batch.measured_depth.assign(rays.depth)
         self.batch.measured_rgb.assign(rays.rgb)
         self.poses = wp.array(rays.poses, dtype=float, device=device, requires_grad=True)
-        self.selected = {
-            level: wp.full(len(grid.rows), 1, dtype=wp.uint8, device=device) for level, grid in source.grids.items()
+        self.places = {
+            level: wp.array(np.arange(len(grid.rows)), dtype=int, device=device) for level, grid in source.grids.items()
         }
 
     def cast_and_sample(self) -> None:
@@ -148,9 +148,7 @@ class Iteration:
 
     def _wanted(self, levels, *, points: bool) -> Gradients:
         grids = {
-            level: GridGradient(
-                gradient_buffers(self.arrays.features[level].shape[0], self.device), self.selected[level]
-            )
+            level: GridGradient(gradient_buffers(self.arrays.features[level].shape[0], self.device), self.places[level])
             for level in levels
         }
         weights = gradient_buffers(COLOR_WEIGHT_ROWS, self.device) if self.stage == "color" else None

@@ -136,7 +136,7 @@ def test_only_selected_rows_get_a_gradient(scene, iteration):
     run = iteration("fine")
     everything = run.mapping().rows
     for level, mask in scene.frustum.items():
-        run.selected[level].assign(mask.astype(np.uint8))
+        run.places[level].assign(np.where(mask, np.arange(len(mask)), -1).astype(np.int32))
     selected = run.mapping().rows
     for level, mask in scene.frustum.items():
         assert everything[level][~mask].any()

@@ -19,8 +19,9 @@ import pytest
 from tests.fakes import FakeSequence, FakeSlam, run_sequence
 from warpslam import cli
 from warpslam.config import Config
-from warpslam.errors import ConfigError, DatasetError, OutputError
+from warpslam.errors import ConfigError, DatasetError, MeshError, OutputError
 from warpslam.frames import FrameStatus
+from warpslam.pipeline import finished
 from warpslam.pipeline import run as pipeline
 from warpslam.runs.folder import RunFolder
 from warpslam.runtime.kernel_cache import kernel_cache_errors
@@ -103,6 +104,49 @@ def test_disk_that_fills_up_during_the_run(fake, small_disk, monkeypatch, caplog
     assert where is not None
     assert len(read_tum(where[1])[0]) == 8
     shutil.rmtree(Path(where[1]).parent)
+
+
+@pytest.mark.parametrize("lost", ["map", "mesh"])
+def test_what_fits_on_a_full_disk_is_written(fake, tmp_path, monkeypatch, lost):
+    """One result that does not fit takes no other one along; what is missing is made later of what is there."""
+    run = tmp_path / "run"
+    real_write = Path.write_bytes
+    real_text = Path.write_text
+
+    def full(write):
+        def call(self, *arguments, **keywords):
+            if self.name.startswith(lost):
+                raise OSError(errno.ENOSPC, "No space left on device", str(self))
+            return write(self, *arguments, **keywords)
+
+        return call
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", full(real_write))
+        patch.setattr(Path, "write_text", full(real_text))
+        with pytest.raises((OutputError, MeshError), match="No space left|can't be written"):
+            run_sequence(FakeSequence(4), Config(), run)
+    there = {path.name for path in run.iterdir()}
+    expected = {"map.safetensors", "mesh.ply", "trajectory.tum", "metrics.json", "frames.csv", "report.html"}
+    assert expected - there == {name for name in expected if name.startswith(lost)}
+    assert json.loads((run / "metrics.json").read_text())["status"] == "failed"
+    monkeypatch.setattr(finished, "load_slam", lambda folder, device=None: FakeSlam(FakeSequence.intrinsics))
+    if lost == "mesh":
+        assert finished.complete(RunFolder(run))[0] == "mesh.ply" and (run / "mesh.ply").is_file()
+
+
+def test_figures_are_there_before_the_map(fake, tmp_path, monkeypatch):
+    """A run that is killed while its map is written leaves a folder that a report can be made of."""
+    seen = {}
+
+    def save(self, path):
+        seen.update(json.loads((path.parent / "metrics.json").read_text()))
+        raise SystemExit
+
+    monkeypatch.setattr(FakeSlam, "save", save)
+    with pytest.raises(SystemExit):
+        run_sequence(FakeSequence(4), Config(), tmp_path / "run")
+    assert seen["status"] == "unfinished" and seen["frames"]["processed"] == 4
 
 
 def test_log_that_can_not_be_written_does_not_end_the_run(fake, tmp_path, monkeypatch, caplog, capsys):

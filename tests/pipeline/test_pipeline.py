@@ -62,7 +62,7 @@ def test_a_run_writes_everything(fake_slam, tmp_path):
     assert {file.name for file in folder.path.iterdir()} == {
         "config.yaml", "trajectory.tum", "ground_truth.tum", "mesh.ply", "map.safetensors", "metrics.json",
         "timing.json", "input.json", "log.txt", "trajectory_top_view.png", "error_over_time.png", "panels.png",
-        "panels.npz", "frames.csv", "frames.json", "report.html",
+        "panels.npz", "frames.csv", "frames.json", "report.html", "manifest.json",
     }  # fmt: skip
     assert yaml.safe_load(folder.config.read_text())["mapping"]["window"] == Config().mapping.window
     metrics = metrics_of(folder.path)
@@ -335,8 +335,8 @@ def test_default_folder_and_latest_link(tmp_path):
 
 
 def test_reused_folder_loses_stale_results_only(tmp_path):
-    """A new run removes what an earlier one wrote and nothing else."""
-    for name in ("metrics.json", "mesh.ply", "notes.txt"):
+    """A new run removes what one that came to nothing wrote, and nothing else."""
+    for name in ("metrics.json", "report.html", "notes.txt"):
         (tmp_path / name).write_text("old")
     RunFolder.create(tmp_path, "x")
     assert [file.name for file in tmp_path.iterdir()] == ["notes.txt"]

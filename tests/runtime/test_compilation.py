@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import warp as wp
@@ -15,7 +16,7 @@ from warpslam import cli
 from warpslam.errors import ConfigError
 from warpslam.pipeline import run as pipeline
 from warpslam.profiling import recorder
-from warpslam.runtime import compilation
+from warpslam.runtime import compilation, kernel_cache
 from warpslam.runtime.compilation import (
     ModuleProgress,
     compile_for_architecture,
@@ -153,3 +154,14 @@ def test_run_shows_and_records_what_it_compiles(empty_cache, monkeypatch, tmp_pa
         modules = read_json(Path(tmp_path / name / "timing.json"))["kernel_modules"]
         assert modules[SMALL[0]]["compiled"] == bool(compiled) and modules[SMALL[0]]["seconds"] > 0
         find_module(SMALL[0]).unload()
+
+
+def test_a_full_kernel_cache_is_told_before_the_compiler_meets_it(monkeypatch, tmp_path):
+    """LLVM ends the process when it can't write; so the room is looked at before a module is built."""
+    usage = SimpleNamespace(free=1000)
+    monkeypatch.setattr(kernel_cache.shutil, "disk_usage", lambda folder: usage)
+    monkeypatch.setattr(compilation, "_binaries", lambda module, target: iter(()))
+    built = []
+    with pytest.raises(ConfigError, match="WARP_CACHE_PATH"):
+        compilation._each(["warpslam.kernels.grid"], "cpu", built.append, None, 1)
+    assert not built

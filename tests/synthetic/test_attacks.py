@@ -14,6 +14,7 @@ from warpslam.synthetic.attacks import (
     HAND_DISTANCE,
     auto_exposure,
     black_out,
+    carry_lamp,
     cover_lens,
     drop_frames,
     freeze,
@@ -119,6 +120,26 @@ def test_black_frames(base):
     sequence = black_out(base, at=5, count=3)
     assert [bool(sequence[index].rgb.any()) for index in range(4, 9)] == [True, False, False, False, True]
     np.testing.assert_array_equal(sequence[6].depth, base[6].depth)
+
+
+def test_lamp_on_the_camera(base):
+    """Light goes by distance and by place in the image: the near is brighter than the far, the middle than the
+    rim; nothing is brighter than it was, and half of the light is there everywhere.
+    """
+    sequence = carry_lamp(base, share=0.5)
+    frame, whole = sequence[30], base[30]
+    np.testing.assert_array_equal(frame.depth, whole.depth)
+    seen = (whole.rgb.min(axis=2) > 40) & (whole.depth > 0)
+    light = frame.rgb.mean(axis=2) / np.maximum(whole.rgb.mean(axis=2), 1.0)
+    assert light[seen].min() > 0.47 and light[seen].max() < 1.02 and np.ptp(light[seen]) > 0.2
+    v, u = np.mgrid[:60, :80]
+    rings = (np.hypot(u - CAMERA.cx, v - CAMERA.cy) // 5).astype(int)
+    ring = seen & (rings == 4)
+    near = whole.depth < np.median(whole.depth[ring])
+    assert light[ring & near].mean() > light[ring & ~near].mean() + 0.03
+    even = carry_lamp(base, share=0.5, reach=1e6)[30].rgb.mean(axis=2) / np.maximum(whole.rgb.mean(axis=2), 1.0)
+    by_ring = [even[seen & (rings == ring)].mean() for ring in range(8)]
+    assert (np.diff(by_ring) < 0).all()
 
 
 def test_half_of_the_depth(base):

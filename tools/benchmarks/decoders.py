@@ -68,8 +68,8 @@ def main(arguments: list[str] | None = None) -> int:
 def whole_grid(ours: Ours, level: str) -> GridGradient:
     """Gradient of all rows of a level."""
     count, device = ours.slam.scene.grids[level].row_count, ours.slam.device
-    selected = wp.array(np.ones(count, np.uint8), dtype=wp.uint8, device=device)
-    return GridGradient(gradient_buffers(count, device), selected)
+    place = wp.array(np.arange(count, dtype=np.int32), dtype=int, device=device)
+    return GridGradient(gradient_buffers(count, device), place)
 
 
 def iterate(ours: Ours, gradients: Gradients, count: int) -> None:

@@ -35,6 +35,7 @@ from warpslam.kernels import imap_density as density
 from warpslam.kernels import imap_network as imap
 from warpslam.meshing import extract_mesh
 from warpslam.poses import check_transform, pose_from_vector, vector_from_pose
+from warpslam.runtime.environment import named_device
 from warpslam.runtime.launching import Launcher, synchronize
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
@@ -72,7 +73,7 @@ class Imap(Baseline):
             seed: Of the initial network and of every random choice. Same input, seed and device: same result.
         """
         super().__init__(intrinsics, config, device, seed)
-        self.device = wp.get_device(device)
+        self.device = named_device(device)
         self.compile_seconds = _compile(self.device)
         self._settings = self.config.imap
         self._launcher = Launcher(self.device)

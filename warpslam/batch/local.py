@@ -197,7 +197,7 @@ class _Coordinator:
             self.on_update(self.statuses[worker.job.name])
 
     def _interrupt(self) -> None:
-        """Let workers write what they have; a second ctrl-C ends them."""
+        """Let workers write what they have; a second ctrl-C or SIGTERM ends them."""
         try:
             self._signal(signal.SIGINT)
             while any(self.slots):

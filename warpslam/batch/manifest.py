@@ -6,11 +6,10 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from warpslam.batch.jobs import Job
 from warpslam.config import Config
-from warpslam.errors import ConfigError
+from warpslam.errors import ConfigError, brief
+from warpslam.reading import load_yaml, read_text
 from warpslam.runs.request import RunRequest, Source, parse_slice
 
 _OF_SOURCE = ("path", "dataset", "camera")
@@ -39,9 +38,9 @@ def read_manifest(path: str | Path, common: Job) -> list[Job]:
     """
     path = Path(path)
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: can't be read as yaml ({' '.join(str(error).split())})") from error
+        content = load_yaml(read_text(path))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path}: can't be read as yaml ({brief(error)})") from error
     if not isinstance(content, dict) or not isinstance(content.get("sequences"), list) or not content["sequences"]:
         raise ConfigError(f"{path}: expected a list 'sequences' of folders, and 'defaults' where wanted")
     unknown = set(content) - {"sequences", "defaults"}

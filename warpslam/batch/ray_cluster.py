@@ -60,6 +60,10 @@ def run_on_ray(
         MissingDependencyError: Ray is not installed.
         ConfigError: A setting can't work, or there is no cluster at ``address``.
     """
+    if address == "local":
+        # A cluster of this machine alone listens to this machine alone, unless the environment says otherwise: it is by
+        # this variable, read when Ray is imported, that Ray tells the two apart.
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")
     try:
         import ray
     except ImportError as error:

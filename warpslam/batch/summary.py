@@ -49,11 +49,11 @@ def first_line(message: str) -> str:
 def write_summary(statuses: Sequence[JobStatus], output: Path) -> tuple[Path, Path]:
     """Write both files; returns their paths."""
     csv_path, html_path = output / "summary.csv", output / "summary.html"
-    with open(csv_path, "w", newline="", encoding="utf-8") as file:
+    with open(csv_path, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         writer.writerows(cells(status) for status in statuses)
-    html_path.write_text(_html(statuses, output), encoding="utf-8")
+    html_path.write_text(_html(statuses, output), encoding="utf-8", errors="backslashreplace")
     return csv_path, html_path
 
 

@@ -19,6 +19,7 @@ from warpslam.pipeline.methods import has_checkpoints
 from warpslam.pipeline.observer import Observer
 from warpslam.runs.folder import RunFolder
 from warpslam.runtime.environment import resident_bytes
+from warpslam.runtime.stopping import terminable
 
 if TYPE_CHECKING:
     from warpslam.runs.record import Progress
@@ -43,12 +44,18 @@ def main() -> None:
     # The run folder's log.txt has the rest.
     handler.setLevel(logging.WARNING)
     logging.basicConfig(format="%(levelname)s: %(message)s", handlers=[handler])
-    execute(Job.from_dict(order["job"]), Path(order["output"]), _print, order["memory_gb"], slot=order["slot"])
+    with terminable():
+        execute(Job.from_dict(order["job"]), Path(order["output"]), _print, order["memory_gb"], slot=order["slot"])
 
 
 def _print(news: dict[str, Any]) -> None:
-    sys.stdout.write(json.dumps(news) + "\n")
-    sys.stdout.flush()
+    try:
+        sys.stdout.write(json.dumps(news) + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # Nobody listens any more: the batch was ended. What is done is written, and the same batch goes on from there.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise KeyboardInterrupt from None
 
 
 def execute(job: Job, output: Path, report: Report, memory_gb: float | None = None, *, slot: int = 0) -> str:
@@ -66,22 +73,22 @@ def execute(job: Job, output: Path, report: Report, memory_gb: float | None = No
     start = time.monotonic()
     state = BatchState.of(job, output)
     has_same_settings = state.fields.get("settings") == job.settings_hash
-    if not has_same_settings:
-        # Before the state file says otherwise: the next process would take them for its own.
-        RunFolder(output / job.name).remove_checkpoints()
     if not has_same_settings or state.fields.get("status") != RUNNING:
         state.fields.clear()
     elif state.fields.get("ending") == MEMORY:
         # Where the process before this one was ended, another one would be too.
         state.write(status=MEMORY)
         return MEMORY
+    if not has_same_settings:
+        # Before the state file says otherwise: the next process would take them for its own.
+        RunFolder(output / job.name).set_checkpoints_aside()
     attempt = state.fields.get("attempt", 0) + 1
     state.write(settings=job.settings_hash, status=RUNNING, attempt=attempt, pid=os.getpid(), message="")
     report({"attempt": attempt})
     watch = MemoryWatch(memory_gb, state, start)
     status, message = FAILED, ""
     try:
-        status, message = _run(job, output / job.name, report, watch, slot)
+        status, message = _run(job, output / job.name, report, watch, slot, go_on=has_same_settings)
     except MemoryBudgetError as error:
         status, message = MEMORY, str(error)
     except WarpSlamError as error:
@@ -97,7 +104,7 @@ def execute(job: Job, output: Path, report: Report, memory_gb: float | None = No
     return status
 
 
-def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) -> tuple[str, str]:
+def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int, *, go_on: bool) -> tuple[str, str]:
     """Status and message."""
     # Warp and torch are loaded once the cores of this process are set.
     from warpslam.pipeline.run import run
@@ -107,7 +114,8 @@ def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int) 
         device=request.device or _device_of(slot),
         checkpoint_every=request.checkpoint_every if has_checkpoints(request.method) else None,
     )
-    result = run(job.request, folder, observer=_Reporter(report, watch), go_on=True)
+    observer = _Reporter(report, watch)
+    result = run(job.request, folder, observer=observer, go_on=go_on, overwrite=True, discard=True)
     anew = result.metrics.started_anew
     message = f"started from the beginning: {anew}" if anew else ""
     return result.status, message

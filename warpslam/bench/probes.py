@@ -17,7 +17,7 @@ from warpslam.field.decoder_files import load_decoders
 from warpslam.field.rendering import render_image
 from warpslam.frames import FrameStatus, read_images
 from warpslam.mapping.frustum import measured_extent, select_in_frustum
-from warpslam.mapping.mapper import Mapper
+from warpslam.mapping.policy import new_mapper
 from warpslam.pipeline.setup import as_configured, load_kernels, open_source, select_frames
 from warpslam.poses import orthonormalized
 from warpslam.runs.given_poses import GivenPoses
@@ -77,7 +77,7 @@ def convergence(job: Job) -> dict[str, Any]:
     images = ImagePool(camera, device)
     images.set(0, rgb, depth)
     mapping = config.mapping.model_copy(update={"coarse": False})
-    mapper = Mapper(scene, camera, mapping, config.sampling, device, job.request.seed)
+    mapper = new_mapper(scene, camera, config.model_copy(update={"mapping": mapping}), device, job.request.seed)
     stride = -(-camera.width // 160)
     measured = depth[::stride, ::stride]
     valid = measured > 0

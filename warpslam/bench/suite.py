@@ -16,7 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from warpslam.bench.studies import STUDIES, Study
 from warpslam.config import Config
-from warpslam.errors import ConfigError
+from warpslam.errors import ConfigError, brief
+from warpslam.reading import load_yaml, read_text
 from warpslam.runs.request import parse_slice
 
 SHIPPED = ("quick",)
@@ -147,15 +148,15 @@ def read_suite(name: str, *data: str | Path) -> Suite:
         own, source, where = Path("."), "shipped", f"suite {name}"
     else:
         try:
-            text = path.read_text(encoding="utf-8")
+            text = read_text(path)
         except (OSError, ValueError) as error:
             shipped = ", ".join(SHIPPED)
             raise ConfigError(f"suite {name} can't be read ({error}); give a file, or one of: {shipped}") from error
         own, source, where = path.parent, str(path), str(path)
     try:
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise ConfigError(f"{where}: can't be read as yaml ({' '.join(str(error).split())})") from error
+        content = load_yaml(text)
+    except ValueError as error:
+        raise ConfigError(f"{where}: can't be read as yaml ({brief(error)})") from error
     try:
         spec = SuiteSpec.model_validate(content)
     except ValidationError as error:

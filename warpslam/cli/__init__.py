@@ -8,21 +8,26 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import os
 import shlex
 import sys
 from collections.abc import Sequence
 
 from warpslam import __version__
-from warpslam.cli.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED
-from warpslam.errors import WarpSlamError
+from warpslam.cli.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_TERMINATED, EXIT_UNEXPECTED
+from warpslam.errors import WarpSlamError, brief, printable
+from warpslam.runtime.stopping import Terminated, terminable, was_terminated
 
 COMMANDS = {
     "run": ("run", "trajectory and coloured mesh of a folder of RGB-D frames"),
     "demo": ("run", "SLAM in a small rendered room; needs no data"),
     "batch": ("batch", "run many sequences, and go on where an earlier batch stopped"),
     "bench": ("bench", "the paper's studies on your sequences: tables, plots and a page"),
-    "check": ("check", "whether a folder of RGB-D frames can be used, before a run"),
+    "check": (
+        "check",
+        "whether a folder of RGB-D frames can be used, before a run; or whether that of a run is as the run left it",
+    ),
     "eval": ("evaluate", "trajectory and reconstruction errors of a run"),
     "report": ("report", "HTML report of a run, or a comparison of several"),
     "render": ("render", "a frame beside what the map renders at its pose, as PNG"),
@@ -45,30 +50,49 @@ def entry_point() -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code: 0, 2 after an error in the input, 130 after ctrl-C."""
+    """Run one command; returns the exit code: 0, 2 after an error in the input, 130 after ctrl-C, 143 after SIGTERM, 70
+    after an error that nobody expected.
+    """
     arguments = sys.argv[1:] if arguments is None else arguments
+    # A name that is not UTF-8 is shown by its bytes; it must not end the program.
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    with terminable():
+        code = _main(arguments)
+        return EXIT_TERMINATED if code == EXIT_INTERRUPTED and was_terminated() else code
+
+
+def _main(arguments: Sequence[str]) -> int:
     options = _parser(arguments).parse_args(arguments)
     options.command_line = shlex.join(["warpslam", *arguments])
     try:
-        code = options.command(options)
+        code: int = options.command(options)
         sys.stdout.flush()
         return code
-    except WarpSlamError as error:
-        if options.debug:
-            raise
-        print(f"warpslam: {error}", file=sys.stderr)
-        return EXIT_ERROR
     except BrokenPipeError:  # the reader of our output has gone, as in "| head"
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_ERROR
-    except OSError as error:
+    except KeyboardInterrupt as error:
+        print(f"warpslam: {'terminated' if isinstance(error, Terminated) else 'interrupted'}", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except Exception as error:
         if options.debug:
             raise
-        print(f"warpslam: {error.filename or 'output'}: {error.strerror or error}", file=sys.stderr)
-        return EXIT_ERROR
-    except KeyboardInterrupt:
-        print("warpslam: interrupted", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        code, text = _told(error)
+        print(f"warpslam: {printable(text)}", file=sys.stderr)
+        return code
+
+
+def _told(error: Exception) -> tuple[int, str]:
+    """Exit code, and what is said in place of a traceback."""
+    if isinstance(error, WarpSlamError):
+        return EXIT_ERROR, str(error)
+    if isinstance(error, MemoryError):
+        return EXIT_ERROR, "out of memory: close other programs, or use smaller images or a coarser map"
+    if isinstance(error, OSError) and (error.strerror or error.filename):
+        return EXIT_ERROR, f"{error.filename or 'output'}: {error.strerror or error}"
+    return EXIT_UNEXPECTED, f"unexpected {type(error).__name__}: {brief(error)} (--debug shows where it comes from)"
 
 
 def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:

@@ -6,6 +6,8 @@ import argparse
 from typing import Any
 
 from warpslam.cli.common import add_command, add_format_options
+from warpslam.runs.folder import RunFolder
+from warpslam.runs.manifest import check_manifest
 from warpslam.sequences.checking import THOROUGH_SAMPLES, check_folder
 from warpslam.storage.json_files import to_json
 
@@ -14,14 +16,22 @@ EXIT_FINDINGS = 1
 
 def add(commands: Any) -> None:
     """Add the command."""
-    check = add_command(commands, "check", _check, "whether a folder of RGB-D frames can be used, before a run")
-    check.add_argument("folder", metavar="FOLDER", help="folder of one sequence")
+    check = add_command(
+        commands,
+        "check",
+        _check,
+        "whether a folder of RGB-D frames can be used, before a run; or whether that of a run is as the run left it",
+    )
+    check.add_argument("folder", metavar="FOLDER", help="folder of one sequence, or of a run")
     add_format_options(check)
     check.add_argument("--all", action="store_true", help="read every frame, not a sample of them")
     check.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _check(options: argparse.Namespace) -> int:
+    run = RunFolder(options.folder)
+    if run.metrics.is_file() or run.manifest.is_file():
+        return _check_run(run, options.json)
     count = None if options.all else THOROUGH_SAMPLES
     report = check_folder(options.folder, options.dataset, options.camera, sample_count=count)
     if options.json:
@@ -35,3 +45,16 @@ def _check(options: argparse.Namespace) -> int:
                 print(f"{'':8} {'':16} -> {finding.remedy}")
         print(f"{len(report.errors)} errors, {len(report.warnings)} warnings")
     return EXIT_FINDINGS if report.errors else 0
+
+
+def _check_run(folder: RunFolder, as_json: bool) -> int:
+    problems = check_manifest(folder)
+    if as_json:
+        print(to_json({"run": folder.path, "problems": problems}))
+    else:
+        for problem in problems:
+            print(f"error    {problem}")
+        print(
+            f"{folder.path}: " + (f"{len(problems)} files differ" if problems else "all files are as the run left them")
+        )
+    return EXIT_FINDINGS if problems else 0

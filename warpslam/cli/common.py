@@ -11,6 +11,7 @@ from typing import Any
 from warpslam.cli.exit_codes import EXIT_INTERRUPTED as EXIT_INTERRUPTED
 from warpslam.config import Config
 from warpslam.errors import ConfigError
+from warpslam.pipeline.log import OneRecord
 from warpslam.pipeline.methods import DEFAULT_METHOD, METHODS
 from warpslam.runs.metrics import Reconstruction, Rendering
 from warpslam.runs.request import ALL_FRAMES, Slice, parse_slice
@@ -100,7 +101,7 @@ def warnings_on_stderr() -> Iterator[None]:
     """Show the package's warnings on standard error."""
     handler = logging.StreamHandler()
     handler.setLevel(logging.WARNING)
-    handler.setFormatter(logging.Formatter("%(levelname)s: %(message)s"))
+    handler.setFormatter(OneRecord("%(levelname)s: %(message)s"))
     # An error that ends the run is printed once, by main.
     handler.addFilter(lambda record: record.exc_info is None)
     logger = logging.getLogger("warpslam")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from warpslam.cli.common import add_command, quiet_warp
+from warpslam.cli.common import add_command, quiet_warp, warnings_on_stderr
+from warpslam.pipeline.finished import complete
 from warpslam.report import write_comparison, write_report
 from warpslam.runs.folder import RunFolder
 
@@ -22,6 +23,10 @@ def add(commands: Any) -> None:
 def _report(options: argparse.Namespace) -> int:
     quiet_warp()
     folders = [RunFolder.open(run) for run in options.runs]
+    with warnings_on_stderr():
+        for folder in folders:
+            for name in complete(folder):
+                print(f"{folder.path}: {name} was missing and is made")
     if len(folders) == 1:
         print(write_report(folders[0], options.output))
     else:

@@ -26,6 +26,7 @@ from warpslam.cli.common import (
 from warpslam.errors import ConfigError
 from warpslam.frames import FrameStatus
 from warpslam.pipeline.checkpoints import read_checkpoint
+from warpslam.pipeline.finished import is_finished
 from warpslam.pipeline.observer import Observer
 from warpslam.pipeline.run import run
 from warpslam.report.text import duration
@@ -59,16 +60,25 @@ def add(commands: Any) -> None:
         "--localize", action="store_true", help="with --map: only track the camera, leave the map alone"
     )
     parser.add_argument("--no-check", action="store_true", help="run even if the checks of the input find an error")
+    _add_overwrite_option(parser)
     add_method_option(parser)
     _add_poses_option(parser)
     _add_checkpoint_option(parser)
     add_run_options(parser)
 
     parser = add_command(commands, "demo", _demo, "SLAM in a small rendered room; needs no data")
+    _add_overwrite_option(parser)
     add_method_option(parser)
     _add_poses_option(parser)
     _add_checkpoint_option(parser)
     add_run_options(parser)
+
+
+def _add_overwrite_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--overwrite", action="store_true",
+        help="-o may hold a run: its results stay until the new ones are whole, and then give way to them",
+    )  # fmt: skip
 
 
 def _add_poses_option(parser: argparse.ArgumentParser) -> None:
@@ -119,11 +129,18 @@ def _demo(options: argparse.Namespace) -> int:
 
 def _resume(options: argparse.Namespace) -> int:
     """Everything is as the checkpoint says; an option that says otherwise is refused by the run."""
-    for name in ("preset", "config", "map", "localize", "output", "camera", "decoders"):
+    for name in ("preset", "config", "map", "localize", "output", "camera", "decoders", "overwrite"):
         if getattr(options, name):
             raise ConfigError(f"--{name} does not go with --resume: it is as when the run was started")
+    folder = RunFolder(options.resume)
     with warnings_on_stderr():
-        saved = read_checkpoint(RunFolder(options.resume))
+        if not folder.is_unfinished:
+            if folder.successor.is_unfinished:
+                folder = folder.successor
+            elif is_finished(folder):
+                print(f"nothing to do: the run in {options.resume} is finished")
+                return 0
+        saved = read_checkpoint(folder)
     was = saved.request
     request = replace(
         was,
@@ -137,7 +154,7 @@ def _resume(options: argparse.Namespace) -> int:
         checkpoint_every=options.checkpoint_every or was.checkpoint_every,
         truth_mesh=options.truth_mesh or was.truth_mesh,
     )
-    options.output = options.resume
+    options.output = str(folder.path)
     return _execute(request, options, saved=saved)
 
 
@@ -157,7 +174,7 @@ def _common(options: argparse.Namespace) -> RunRequest:
 def _execute(request: RunRequest, options: argparse.Namespace, **keywords: Any) -> int:
     quiet_warp()
     with warnings_on_stderr(), _display() as display:
-        result = run(request, options.output, observer=display, **keywords)
+        result = run(request, options.output, observer=display, overwrite=options.overwrite, **keywords)
     _print_summary(result)
     return EXIT_INTERRUPTED if result.status == INTERRUPTED else 0
 

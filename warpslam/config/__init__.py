@@ -10,5 +10,6 @@ from warpslam.config.settings import LoopConfig as LoopConfig
 from warpslam.config.settings import MappingConfig as MappingConfig
 from warpslam.config.settings import MeshingConfig as MeshingConfig
 from warpslam.config.settings import SamplingConfig as SamplingConfig
+from warpslam.config.settings import SupervisionConfig as SupervisionConfig
 from warpslam.config.settings import TrackingConfig as TrackingConfig
 from warpslam.config.settings import TsdfConfig as TsdfConfig

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import yaml
-
 from warpslam.errors import ConfigError
+from warpslam.reading import load_yaml
 
 
 def merge(into: dict[str, Any], values: dict[str, Any]) -> None:
@@ -28,8 +27,8 @@ def parse_override(text: str) -> dict[str, Any]:
     if not separator or not name:
         raise ConfigError(f"--set {text!r}: expected group.field=value, for example mapping.iterations=30")
     try:
-        parsed: Any = yaml.safe_load(value)
-    except (yaml.YAMLError, ValueError, RecursionError):
+        parsed: Any = load_yaml(value)
+    except ValueError:
         raise ConfigError(f"--set {text!r}: the value can't be parsed") from None
     # yaml reads 1e-3 as a string.
     if isinstance(parsed, str):

@@ -30,6 +30,11 @@ def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, A
 _TUM_GRID = {"middle_spacing": 0.16, "fine_spacing": 0.08, "color_spacing": 0.08}
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
+    "live": {
+        "grid": {"fine_spacing": 0.08},
+        "mapping": {"loss": "direct", "every": 1, "pixels": 800, "iterations": 3, "first_iterations": 60},
+        "meshing": {"level_set": 0.0},
+    },
     "thorough": {"mapping": {"every": 2, "iterations": 90}},
     "replica": {"tracking": {"ignore_edge_u": 100, "ignore_edge_v": 100}},
     "scannet": {},

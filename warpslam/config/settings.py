@@ -14,7 +14,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from warpslam.config.overrides import merge, parse_override
 from warpslam.config.presets import PRESETS
-from warpslam.errors import ConfigError
+from warpslam.errors import ConfigError, brief
+from warpslam.reading import load_yaml, read_text
 
 _FOLLOW_GIVEN_POSES = ("bundle_adjustment", "depth_start")  # of the mapping group, see `Config.resolved`
 
@@ -149,7 +150,14 @@ class MappingConfig(_Group):
         5.0, gt=0, description="all grid and decoder rates grow by this on the first frame"
     )
     color_weight: float = Field(0.2, ge=0, description="lambda_p of Eq. 10")
-    loss: Literal["sum", "mean"] = Field("sum", description="sums over rays (released code) or means (Eq. 8-9)")
+    loss: Literal["direct", "rendering"] = Field(
+        "rendering",
+        description="direct: every sample against the measured depth (group supervision); rendering: depth and colour "
+        "of whole rays (paper)",
+    )
+    loss_reduction: Literal["sum", "mean"] = Field(
+        "sum", description="of the rendering loss: sums over rays (released code) or means (Eq. 8-9)"
+    )
     train_color_decoder: bool = Field(True, description="the colour decoder is optimised with the map")
     moved_margin: float = Field(
         0.0,
@@ -181,6 +189,31 @@ class MappingConfig(_Group):
     bundle_adjustment_keyframes: int = Field(5, ge=2, description="keyframes needed before poses are refined")
     color_refinement: bool = Field(True, description="refine the whole map after the last frame")
     refinement_rounds: int = Field(5, ge=1, description="rounds of `iterations` in the final refinement")
+
+
+class SupervisionConfig(_Group):
+    """The direct loss of mapping (``mapping.loss: direct``): a logit of slope x signed distance in a band about the
+    measured depth, and below that in front of it.
+    """
+
+    slope: float = Field(8.0, gt=0, description="logit by signed distance [1/m]")
+    front: float = Field(0.1, gt=0, description="the band begins so far before the measured surface [m]")
+    behind: float = Field(0.05, gt=0, description="and ends so far behind it [m]")
+    behind_weight: float = Field(0.5, ge=0, le=1, description="weight of samples behind the surface")
+    free_samples: int = Field(4, ge=1, le=64, description="samples of a ray before the band")
+    edge_samples: int = Field(
+        2, ge=0, le=64, description="of these, at the depth of pixels beside it, where that is smaller"
+    )
+    near_samples: int = Field(8, ge=1, le=64, description="samples of a ray in the band; one more lies at its depth")
+    replay_share: float = Field(0.5, ge=0, lt=1, description="share of rays of earlier keyframes that see the same")
+    young_updates: int = Field(
+        20, ge=1, description="rays are drawn to where a vertex was updated less often than this"
+    )
+    middle_rate: float = Field(0.05, gt=0, description="learning rate of middle features")
+    fine_rate: float = Field(0.02, gt=0, description="learning rate of fine features")
+    color_rate: float = Field(0.01, gt=0, description="learning rate of colour features")
+    decoder_rate: float = Field(0.003, gt=0, description="learning rate of the colour decoder, where it is trained")
+    color_reach: float = Field(0.02, ge=0, description="samples get a colour so far from the surface [m]")
 
 
 class DirectConfig(_Group):
@@ -224,6 +257,11 @@ class DirectConfig(_Group):
     search_kept: int = Field(3, ge=1, le=20, description="rotations tried further")
     search_weak: bool = Field(True, description="search along the two motions that depth determines least, too")
     search_steps: int = Field(16, ge=1, le=64, description="steps of a pixel along these, both ways")
+    feature_rows: Literal["doubt", "always", "never"] = Field(
+        "never",
+        description="frames where rows of sparse features join those of the images: those in doubt and those with a "
+        "weakly determined direction, all (some 25 ms more a frame), or none",
+    )
     relocalization_keyframes: int = Field(60, ge=1, description="latest keyframes that a lost camera is looked for at")
 
 
@@ -321,6 +359,7 @@ class Config(_Group):
     direct: DirectConfig = Field(default_factory=DirectConfig)
     loops: LoopConfig = Field(default_factory=LoopConfig)
     mapping: MappingConfig = Field(default_factory=MappingConfig)
+    supervision: SupervisionConfig = Field(default_factory=SupervisionConfig)
     keyframes: KeyframeConfig = Field(default_factory=KeyframeConfig)
     meshing: MeshingConfig = Field(default_factory=MeshingConfig)
     imap: ImapConfig = Field(default_factory=ImapConfig)
@@ -423,9 +462,11 @@ class Config(_Group):
             ConfigError: The file can't be read, is no yaml mapping, or a value does not fit.
         """
         try:
-            values = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        except (OSError, yaml.YAMLError, ValueError, RecursionError) as error:
-            raise ConfigError(f"{path}: can't be read as yaml: {error}") from None
+            values = load_yaml(read_text(path))
+        except OSError as error:
+            raise ConfigError(f"{path}: can't be read ({error.strerror or error})") from None
+        except ValueError as error:
+            raise ConfigError(f"{path}: can't be read as yaml: {brief(error)}") from None
         if not isinstance(values, dict):
             raise ConfigError(f"{path}: expected a mapping of groups, found {type(values).__name__}")
         return cls.from_dict(values, source=str(path))

@@ -13,6 +13,7 @@ from warpslam.field.packing import PackedDecoder
 from warpslam.kernels.compositing import Box
 from warpslam.kernels.grid import Lattice, Level, Vec32
 from warpslam.kernels.pixels import Camera
+from warpslam.kernels.touched_rows import Touched
 from warpslam.runtime.cores import slice_count
 
 
@@ -63,10 +64,16 @@ class FieldArrays:
 
 @dataclass
 class GridGradient:
-    """Gradient of one level: ``buffers`` (slices, rows) of `Vec32`; rows with ``selected`` 0 get none."""
+    """Gradient of one level: ``buffers`` (slices, places) of `Vec32`, and the ``place`` of each row in them, int
+    (rows,), -1 for rows that get none.
+
+    touched: Where the rows that get a gradient are listed in the adjoint, which gives them their places; None = places
+        are given.
+    """
 
     buffers: wp.array
-    selected: wp.array
+    place: wp.array
+    touched: Touched | None = None
 
 
 @dataclass

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import warnings
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warpslam.errors import CheckpointError
+from warpslam.errors import CheckpointError, brief
 from warpslam.field.decoders import (
     BLOCK_COUNT,
     EMBEDDING_SIZE,
@@ -23,8 +24,10 @@ from warpslam.field.decoders import (
     import_torch,
     random_decoder,
 )
+from warpslam.reading import MEGABYTE, check_regular
 
 DEFAULT_PATH = Path(__file__).parents[1] / "data" / "decoders.pth"
+_FILE_LIMIT = 512 * MEGABYTE
 _NESTING_KEYS = ("decoder_state_dict", "decoders", "model", "state_dict", "decoder")
 
 
@@ -167,6 +170,7 @@ def _read_checkpoint(path: Path) -> Mapping[str, Any]:
             "holds coarse.pt and middle_fine.pt."
         )
     torch = import_torch()
+    _check_sums(path)
     try:
         with _numpy_scalars_allowed(torch), warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -181,6 +185,30 @@ def _read_checkpoint(path: Path) -> Mapping[str, Any]:
     if not isinstance(checkpoint, Mapping):
         raise CheckpointError(f"{path}: holds a {type(checkpoint).__name__}, expected a state dict.")
     return checkpoint
+
+
+def _check_sums(path: Path) -> None:
+    """The check sums of a zip file, which torch writes and does not look at: one bit would make other weights.
+
+    Files of torch before 1.6 are no zip files, and have none.
+    """
+    try:
+        check_regular(path, _FILE_LIMIT)
+        if not zipfile.is_zipfile(path):
+            return
+        with zipfile.ZipFile(path) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > 2 * _FILE_LIMIT:
+                raise CheckpointError(f"{path}: unpacks to more than any decoder has. Use another copy.")
+            damaged = archive.testzip()
+    except OSError as error:
+        raise CheckpointError(f"{path}: can't be read ({error.strerror or error}).") from error
+    except Exception as error:  # zipfile has many
+        raise CheckpointError(f"{path}: damaged ({brief(error)}). Download or save it again.") from error
+    if damaged is not None:
+        raise CheckpointError(
+            f"{path}: the check sum of its part {brief(damaged)!r} does not agree with the content, which is truncated "
+            "or altered. Download or save it again."
+        )
 
 
 def _numpy_scalars_allowed(torch: Any) -> contextlib.AbstractContextManager[None]:

@@ -21,19 +21,14 @@ def query(batch: RayBatch, arrays: FieldArrays, stage: str) -> None:
     """Logit (and colour, in the colour stage) of every sample: `RayBatch.logit`, `RayBatch.color`."""
 
     def steps(first: int, stop: int, slot: int) -> list[Step]:
-        result = query_logits(batch, arrays, stage, first, stop, slot)
+        result = [begin_rays(batch, first, stop, slot)]
+        result += logits(batch, arrays, stage, first, stop, 0, batch.sample_count, EXACT)
         if stage == "color":
             result.append(_weighty_samples(batch, first, stop, slot, 0.0))
-            result.append(_color_forward(batch, arrays, first, stop, slot))
+            result.append(color_forward(batch, arrays, first, stop, slot))
         return result
 
     batch.launcher.slices(batch.count, steps, whole=batch.kernels.by_sample)
-
-
-def query_logits(batch: RayBatch, arrays: FieldArrays, stage: str, first: int, stop: int, slot: int) -> list[Step]:
-    """Logit of every sample of some rays that are kept."""
-    samples = batch.sample_count
-    return [_start(batch, first, stop, slot), *_logits(batch, arrays, stage, first, stop, 0, samples, EXACT)]
 
 
 def render(
@@ -59,9 +54,9 @@ def render(
     weigh = _weigh_by_sample if batch.kernels.by_sample else _weigh_by_ray
 
     def steps(first: int, stop: int, slot: int) -> list[Step]:
-        result = [_start(batch, first, stop, slot), *weigh(batch, arrays, stage, first, stop, slot, thresholds)]
+        result = [begin_rays(batch, first, stop, slot), *weigh(batch, arrays, stage, first, stop, slot, thresholds)]
         if stage == "color":
-            result.append(_color_forward(batch, arrays, first, stop, slot, weights))
+            result.append(color_forward(batch, arrays, first, stop, slot, weights))
             inputs = [first, batch.sample_count, batch.keep, batch.color, batch.weight, batch.rgb]
             result.append((compositing.composite_color, stop - first, inputs))
         return result
@@ -81,6 +76,11 @@ def steep_samples(batch: RayBatch, first: int, stop: int, slot: int, min_gradien
     """List the samples of some rays whose logit has a gradient beyond ``min_gradient``."""
     inputs = [first, steep_list(batch, first, slot), batch.sample_count, batch.logit_grad, min_gradient]
     return (compositing.list_steep, stop - first, inputs)
+
+
+def color_list(batch: RayBatch, first: int, slot: int) -> Listed:
+    """A slice's samples that need colour."""
+    return _listed(batch, first, slot, batch.weighty, batch.weighty_count)
 
 
 def steep_list(batch: RayBatch, first: int, slot: int) -> Listed:
@@ -115,7 +115,7 @@ def color_adjoint(
 ) -> list[Step]:
     """From the gradient of the samples' colours to that of the features, of the points, and of the weights."""
     blocks = batch.kernels.color_blocks
-    listed = _listed(batch, first, slot, batch.weighty, batch.weighty_count)
+    listed = color_list(batch, first, slot)
     weights = _weight_gradient(batch, gradients.color_weights)
     inputs = [listed, blocks, batch.rays, arrays.level("color"), _weights(batch, arrays, "color"), batch.color_grad]
     inputs += [_grid_gradient(batch, gradients, "color"), int(gradients.points), point_grad, weights]
@@ -128,6 +128,15 @@ def color_adjoint(
     return result
 
 
+def collect_rays(batch: RayBatch, gradients: Gradients, first: int, stop: int) -> Step:
+    """From the gradient of the points to that of the rays."""
+    counts = batch.inlier if gradients.inliers_move else batch.keep
+    inputs = [batch.rays, batch.keep, counts, batch.point_grad, batch.origin.grad, batch.direction.grad]
+    if batch.kernels.by_sample:
+        return (by_sample.collect_ray_gradients, (stop - first, by_sample.PARTS), inputs)
+    return (rays.collect_ray_gradients, stop - first, [first, *inputs])
+
+
 def _scatter(
     batch: RayBatch, arrays: FieldArrays, level: str, gradients: Gradients, listed: Listed, ray_count: int
 ) -> list[Step]:
@@ -138,13 +147,21 @@ def _scatter(
     return [(batch.kernels.scatter_features, (-(-ray_count * batch.sample_count // RUN), 32), inputs)]
 
 
-def _start(batch: RayBatch, first: int, stop: int, slot: int) -> Step:
-    listed = _listed(batch, first, slot, batch.weighty, batch.weighty_count)
-    inputs = [first, listed, batch.keep, batch.transmittance, batch.depth, batch.variance, batch.rgb]
+def begin_rays(batch: RayBatch, first: int, stop: int, slot: int) -> Step:
+    """Empty the slice's list of samples that need colour, and mark the rays that are kept."""
+    inputs = [
+        first,
+        color_list(batch, first, slot),
+        batch.keep,
+        batch.transmittance,
+        batch.depth,
+        batch.variance,
+        batch.rgb,
+    ]
     return (compositing.start_rays, stop - first, inputs)
 
 
-def _logits(
+def logits(
     batch: RayBatch,
     arrays: FieldArrays,
     stage: str,
@@ -181,7 +198,7 @@ def _weigh_by_ray(
     result: list[Step] = []
     for sample in range(0, samples, width):
         group = min(width, samples - sample)
-        result += _logits(batch, arrays, stage, first, stop, sample, group, thresholds)
+        result += logits(batch, arrays, stage, first, stop, sample, group, thresholds)
         inputs = [first, sample, group, thresholds.min_transmittance, arrays.bound, batch.rays, batch.rendered]
         result.append((compositing.composite, ray_count, [*inputs, batch.transmittance, batch.depth]))
     inputs = [first, batch.rays, batch.keep, batch.weight, batch.depth, batch.variance]
@@ -196,11 +213,11 @@ def _weigh_by_sample(
 ) -> list[Step]:
     """`_weigh_by_ray` with a thread a sample, all samples at once."""
     samples = batch.sample_count
-    result = _logits(batch, arrays, stage, first, stop, 0, samples, thresholds)
+    result = logits(batch, arrays, stage, first, stop, 0, samples, thresholds)
     min_weight = thresholds.min_weight if stage == "color" else 0.0
     inputs = [arrays.bound, batch.rays, batch.keep, batch.rendered, min_weight]
     result.append((by_sample.weigh_samples, (stop - first) * samples, inputs))
-    listed = _listed(batch, first, slot, batch.weighty, batch.weighty_count)
+    listed = color_list(batch, first, slot)
     inputs = [listed, batch.rays, batch.keep, batch.weight, int(stage == "color"), min_weight]
     result.append((by_sample.sum_rays, stop - first, [*inputs, batch.depth, batch.variance]))
     return result
@@ -208,16 +225,16 @@ def _weigh_by_sample(
 
 def _weighty_samples(batch: RayBatch, first: int, stop: int, slot: int, min_weight: float) -> Step:
     """List the samples of some rays that weigh at least ``min_weight``; the others are black."""
-    listed = _listed(batch, first, slot, batch.weighty, batch.weighty_count)
+    listed = color_list(batch, first, slot)
     inputs = [first, listed, batch.sample_count, batch.keep, batch.weight, min_weight, batch.color]
     return (compositing.list_weighty, stop - first, inputs)
 
 
-def _color_forward(
+def color_forward(
     batch: RayBatch, arrays: FieldArrays, first: int, stop: int, slot: int, weight_gradient: wp.array | None = None
 ) -> Step:
     """Colour (Eq. 5) of the samples that are listed for it."""
-    inputs = [_listed(batch, first, slot, batch.weighty, batch.weighty_count), batch.rays, arrays.level("color")]
+    inputs = [color_list(batch, first, slot), batch.rays, arrays.level("color")]
     inputs += [_weights(batch, arrays, "color"), _weight_gradient(batch, weight_gradient), batch.color]
     return (batch.kernels.color_forward, batch.kernels.thread_count((stop - first) * batch.sample_count), inputs)
 
@@ -239,13 +256,7 @@ def _adjoint(
         if stage == "color" and (gradients.points or want_weights or "color" in gradients.grids):
             result += color_adjoint(batch, arrays, gradients, first, stop, slot, batch.point_grad)
         if gradients.points:
-            counts = batch.inlier if gradients.inliers_move else batch.keep
-            inputs = [batch.rays, batch.keep, counts, batch.point_grad, batch.origin.grad, batch.direction.grad]
-            if batch.kernels.by_sample:
-                dim = (stop - first, by_sample.PARTS)
-                result.append((by_sample.collect_ray_gradients, dim, inputs))
-            else:
-                result.append((rays.collect_ray_gradients, stop - first, [first, *inputs]))
+            result.append(collect_rays(batch, gradients, first, stop))
         return result
 
     commands = batch.launcher.slice_commands(batch.count, steps, whole=batch.kernels.by_sample)
@@ -291,7 +302,7 @@ def _grid_gradient(batch: RayBatch, gradients: Gradients, level: str) -> RowGrad
     return struct(
         RowGradient,
         wanted=int(wanted is not None),
-        selected=batch.no_selection if wanted is None else wanted.selected,
+        place=batch.no_places if wanted is None else wanted.place,
         rows=rows,
         by_sample=batch.feature_grad,
         entries=entries(rows),

@@ -32,10 +32,15 @@ from warpslam.kernels.grid import Vec32
 from warpslam.kernels.pixels import Draw, ErrorCells, Images, Pixels
 from warpslam.kernels.samples import Placement, Rays
 from warpslam.runtime.cores import slice_count
+from warpslam.runtime.environment import check_memory
 from warpslam.runtime.launching import Launcher, Step
 
 if TYPE_CHECKING:
     from warpslam.field.objectives import MotionArrays
+
+
+_POINT_BYTES = 72 + 4 * 3 * layout.MASK_WORDS
+"""What a sample takes, without gradients of weights."""
 
 
 class RayBatch:
@@ -48,6 +53,7 @@ class RayBatch:
         self.count = 0
         self.sample_count = 0
         points = capacity * max_samples
+        check_memory(device, _POINT_BYTES * points, f"rays ({capacity}) and samples ({max_samples} each): lower either")
 
         def zeros(shape: int, dtype: Any = float, grad: bool = False) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device, requires_grad=grad)
@@ -91,7 +97,7 @@ class RayBatch:
         self.bits["coarse"] = self.bits["middle"]
         empty = wp.zeros((1, 1), dtype=Vec32, device=device)
         self.no_errors = wp.zeros((1, 1), dtype=float, device=device)
-        self.no_rows, self.no_selection = empty, wp.zeros(1, dtype=wp.uint8, device=device)
+        self.no_rows, self.no_places = empty, wp.zeros(1, dtype=int, device=device)
         self.activations = self.layer_grad = self.feature_grad = empty
         self.layer_inputs = wp.zeros((1, 1, 1), dtype=float, device=device)
         self.motion: MotionArrays | None = None
@@ -229,7 +235,7 @@ class RayBatch:
     ) -> None:
         """After `bound`: leave out the rays of other frames that the current one contradicts, for something has moved.
 
-        current: Its place in the window; its image is in slot 0.
+        current: Its first place in the window, whose last frames are the current one; its image is in slot 0.
         T_world_camera: Its pose (4, 4).
         margin: By how much [m].
         """

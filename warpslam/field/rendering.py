@@ -9,10 +9,11 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.config import SamplingConfig
+from warpslam.errors import InputError
 from warpslam.field.arrays import FieldArrays
 from warpslam.field.passes import render, take_surface_depth
 from warpslam.field.ray_batch import RayBatch
-from warpslam.poses import vector_from_pose
+from warpslam.poses import MAX_DISTANCE, as_numbers, vector_from_pose
 from warpslam.runtime.phases import phase
 
 RAYS_PER_CHUNK = 8192
@@ -50,11 +51,22 @@ def render_image(
     its samples
     evenly over the map, and the depth it finds places those of the second: nothing but the map enters.
     """
+    if (
+        not isinstance(stride, int | np.integer)
+        or isinstance(stride, bool)
+        or not 1 <= stride <= max(camera.width, camera.height)
+    ):
+        raise InputError(f"stride = {stride!r} must be a whole number from 1 to the size of the image")
+    stride = int(stride)
     if depth is None:
         coarse = _render(arrays, camera, T_world_camera, sampling, device, None, stride)
         depth = coarse.depth
     else:
+        depth = as_numbers(depth, "depth")
+        if depth.shape != (camera.height, camera.width):
+            raise InputError(f"depth has shape {depth.shape}, expected {(camera.height, camera.width)}")
         depth = np.ascontiguousarray(depth[::stride, ::stride], np.float32)
+        depth = np.where((depth > 0) & (depth <= MAX_DISTANCE), depth, np.float32(0.0))  # NaN is missing
     return _render(arrays, camera, T_world_camera, sampling, device, depth, stride)
 
 

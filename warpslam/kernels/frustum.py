@@ -8,7 +8,7 @@ measured surface (bilinear depth at its pixel; the largest looked-up depth where
 import warp as wp
 
 from warpslam.kernels.grid import Lattice, row_of, vertex_position
-from warpslam.kernels.pixels import Camera
+from warpslam.kernels.pixels import Camera, place_of
 
 MODULE = "warpslam.views"
 """What a depth image says of vertices and points compiles as one Warp module."""
@@ -19,8 +19,8 @@ def bilinear_depth(image: wp.array2d[float], u: float, v: float) -> float:
     """Bilinear lookup, 0 outside the image."""
     height = image.shape[0]
     width = image.shape[1]
-    u0 = int(wp.floor(u))
-    v0 = int(wp.floor(v))
+    u0 = place_of(wp.floor(u))
+    v0 = place_of(wp.floor(v))
     fu = u - float(u0)
     fv = v - float(v0)
     total = float(0.0)

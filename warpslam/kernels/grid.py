@@ -5,7 +5,7 @@ A level stores one row of 32 features per lattice vertex, array ``features`` of 
     u    = (p - origin) / spacing, clamped to [0, shape - 1] on every axis
     c(p) = sum over the 8 corners of the cell: w_corner(u) * features[row_of(corner)]
 
-Adjoint for an incoming gradient dc: ``grad[row] += w_corner * dc`` for rows that are selected, and
+Adjoint for an incoming gradient dc: ``grad[place[row]] += w_corner * dc`` for rows that have a place, and
 ``dp = sum_corner (dw_corner / du) (dc . features[row]) / spacing``, zero along an axis that was clamped.
 """
 
@@ -65,14 +65,14 @@ def find_cell(lattice: Lattice, p: wp.vec3) -> Cell:
         last = lattice.shape[axis] - 1
         x = u[axis]
         free = float(1.0)
-        # Border padding; the gradient along a clamped axis is zero (grid_sample's rule).
-        if x <= 0.0:
+        # Border padding; the gradient along a clamped axis is zero (grid_sample's rule). NaN is clamped, too.
+        if not (x > 0.0):
             x = float(0.0)
             free = float(0.0)
         if x >= float(last):
             x = float(last)
             free = float(0.0)
-        low = wp.min(int(x), last - 1)
+        low = wp.clamp(int(x), 0, last - 1)  # whatever comes in, no index leaves the grid
         cell.corner[axis] = low
         cell.offset[axis] = x - float(low)
         cell.free[axis] = free
@@ -148,21 +148,21 @@ def interpolate_adjoint_point(level: Level, cell: Cell, dc: Vec32) -> wp.vec3:
 def interpolate_adjoint_features(
     grad: wp.array2d[Vec32],
     slot: int,
-    selected: wp.array[wp.uint8],
+    place: wp.array[int],
     lattice: Lattice,
     cell: Cell,
     dc: Vec32,
 ):
-    """Add the gradient to the selected ones of the 8 rows, in gradient buffer ``slot`` (one a CPU thread)."""
+    """Add the gradient to those of the 8 rows that have a place, in gradient buffer ``slot`` (one a CPU thread)."""
     i = cell.corner[0]
     j = cell.corner[1]
     k = cell.corner[2]
     for di in range(2):
         for dj in range(2):
             for dk in range(2):
-                row = row_of(lattice, i + di, j + dj, k + dk)
-                if selected[row] != wp.uint8(0):
-                    wp.atomic_add(grad, slot, row, corner_weight(cell.offset, di, dj, dk) * dc)
+                n = place[row_of(lattice, i + di, j + dj, k + dk)]
+                if n >= 0:
+                    wp.atomic_add(grad, slot, n, corner_weight(cell.offset, di, dj, dk) * dc)
 
 
 @wp.func

@@ -68,11 +68,19 @@ def pixel_direction(u: int, v: int, camera: Camera) -> wp.vec3:
 
 
 @wp.func
+def place_of(x: float) -> int:
+    """A coordinate as a whole number. Far outside every image it is no farther than there: converted as they are, huge
+    numbers become the largest integer on CUDA, to which nothing can be added, and NaN becomes anything.
+    """
+    return int(wp.clamp(x, -2.0, 32768.0))
+
+
+@wp.func
 def nearest_pixel(q: wp.vec3, camera: Camera) -> wp.vec2i:
     """The pixel that a point in front of the camera, in its coordinates, falls on; it may lie outside the image."""
     return wp.vec2i(
-        int(wp.rint(camera.focal[0] * q[0] / q[2] + camera.center[0])),
-        int(wp.rint(camera.focal[1] * q[1] / q[2] + camera.center[1])),
+        place_of(wp.rint(camera.focal[0] * q[0] / q[2] + camera.center[0])),
+        place_of(wp.rint(camera.focal[1] * q[1] / q[2] + camera.center[1])),
     )
 
 

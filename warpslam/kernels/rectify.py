@@ -129,8 +129,8 @@ def color_at(rgb: wp.array3d[wp.uint8], q: wp.vec2, channel: int) -> float:
     width = rgb.shape[1]
     x = wp.clamp(q[0], 0.0, float(width - 1))
     y = wp.clamp(q[1], 0.0, float(height - 1))
-    u = wp.min(int(x), width - 2)
-    v = wp.min(int(y), height - 2)
+    u = wp.clamp(int(x), 0, width - 2)
+    v = wp.clamp(int(y), 0, height - 2)
     x -= float(u)
     y -= float(v)
     upper = (1.0 - x) * float(rgb[v, u, channel]) + x * float(rgb[v, u + 1, channel])

@@ -6,6 +6,9 @@ from warpslam.kernels.grid import Lattice, find_cell, row_of
 from warpslam.kernels.pixels import MODULE, Camera, Images, measured, nearest_pixel
 from warpslam.kernels.samples import Rays
 
+MAX_STEPS = wp.constant(1 << 16)
+"""Places at which a ray is looked at, at most."""
+
 
 @wp.func
 def least_and_largest_depth(images: Images, slot: int, pixel: wp.vec2i) -> wp.vec2:
@@ -52,16 +55,17 @@ def drop_contradicted(
     depth: wp.array[float],
     keep: wp.array[int],
 ):
-    """Leave out the rays of earlier frames that the current depth image, in slot 0, contradicts by ``margin``: it sees
-    through the point they measured, or measures a surface that they pass through.
+    """Leave out the rays of earlier frames, those before ``current`` in the window, that the current depth image, in
+    slot 0, contradicts by ``margin``: it sees through the point they measured, or measures a surface that they pass
+    through.
 
     A ray is looked at every half ``margin``. A pixel speaks only where its neighbours agree, so that outlines, where a
     little shift of the camera changes everything, contradict nothing.
     """
     tid = wp.tid()
-    if keep[tid] == 0 or frame[tid] == current or depth[tid] <= 0.0:
+    if keep[tid] == 0 or frame[tid] >= current or depth[tid] <= 0.0:
         return
-    count = int(depth[tid] / (0.5 * margin)) + 1
+    count = wp.clamp(int(depth[tid] / (0.5 * margin)), 0, MAX_STEPS) + 1
     for n in range(count):
         # The last one is the point that was measured.
         z = depth[tid] * float(n + 1) / float(count)

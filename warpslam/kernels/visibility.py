@@ -55,9 +55,10 @@ def signed_distance(
     start = views.image[view][0]
     width = views.image[view][1]
     height = views.image[view][2]
-    if u < -0.5 or v < -0.5 or u >= float(width) - 0.5 or v >= float(height) - 0.5:
+    # So that NaN is outside.
+    if not (u >= -0.5 and v >= -0.5 and u < float(width) - 0.5 and v < float(height) - 0.5):
         return NOT_SEEN
-    nearest = views.depth[start + int(v + 0.5) * width + int(u + 0.5)]
+    nearest = views.depth[start + wp.min(int(v + 0.5), height - 1) * width + wp.min(int(u + 0.5), width - 1)]
     distance = nearest - q[2]
     if nearest <= 0.0 or distance < -views.max_behind:
         return NOT_SEEN

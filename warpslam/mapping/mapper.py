@@ -30,6 +30,7 @@ from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.optimizers import ColorDecoderOptimizer, GridOptimizer, PoseOptimizer
 from warpslam.scene.scene_map import SceneMap
+from warpslam.scene.touched_rows import TouchedRowsState
 
 # What each stage optimises; the learning rates by stage are those of the authors' released code.
 _STAGE_LEVELS = {
@@ -161,6 +162,13 @@ class Mapper:
     def changed_rows(self) -> dict[str, wp.array]:
         """Rows of each level that the last call may have changed, int (n,); levels it left alone are absent."""
         return {level: self._grids[level].rows for level in self._changed}
+
+    def state(self) -> dict[str, TouchedRowsState]:
+        """Nothing: a call begins with fresh moments."""
+        return {}
+
+    def restore(self, state: dict[str, TouchedRowsState]) -> None:
+        """Nothing to put back; see `state`."""
 
     # -- one call ------------------------------------------------------------------------------------------------
 
@@ -303,7 +311,7 @@ class Mapper:
             if config.moved_margin > 0 and current > 0:
                 batch.drop_contradicted(images.arrays, current, T_world_camera, self.camera, config.moved_margin)
             batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)
-            scale = 1.0 / batch.count if config.loss == "mean" else 1.0
+            scale = 1.0 / batch.count if config.loss_reduction == "mean" else 1.0
             thresholds = Thresholds(sampling.min_weight, sampling.min_gradient * scale, sampling.min_transmittance)
             render(batch, arrays, stage, gradients, tape, thresholds=thresholds)
             if gradients.points and gradients.inliers_move:
@@ -347,7 +355,7 @@ class Mapper:
                 batch.bound(arrays, use_depth=False)
                 batch.place_samples(sampling.stratified, 0, use_depth=False, jitter=sampling.jitter)
                 render(batch, arrays, "coarse", gradients, tape)
-                mapping_loss(batch, 0.0, 1.0 / batch.count if config.loss == "mean" else 1.0)
+                mapping_loss(batch, 0.0, 1.0 / batch.count if config.loss_reduction == "mean" else 1.0)
             self._launcher.call(partial(tape.backward, batch.loss))
             optimizer.update(self.scene.grids["coarse"].features, config.coarse_rate * rate_factor)
             batch.next_iteration()

@@ -28,7 +28,8 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import warp as wp
 
-from warpslam.mapping.mapper import Mapper, MappingResult
+from warpslam.mapping.mapper import MappingResult
+from warpslam.mapping.policy import MapOptimizer
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.scene_map import SceneMap
@@ -53,7 +54,7 @@ class MappingTask:
     rounds: range = range(0)
     """Numbers of the rounds of a refinement."""
 
-    def start(self, mapper: Mapper, images: ImagePool, keyframes: list[Keyframe]) -> Callable[[], MappingResult]:
+    def start(self, mapper: MapOptimizer, images: ImagePool, keyframes: list[Keyframe]) -> Callable[[], MappingResult]:
         """Launch the work; the function that is returned waits for it and reads its outcome."""
         if self.extent is not None:
             mapper.scene.cover(*self.extent)
@@ -88,7 +89,7 @@ class Scheduler(Protocol):
         """
 
 
-def new_scheduler(schedule: str, mapper: Mapper, images: ImagePool) -> Scheduler:
+def new_scheduler(schedule: str, mapper: MapOptimizer, images: ImagePool) -> Scheduler:
     """The schedule of `Config.schedule`; ``mapper`` works on the map that the tracker reads."""
     return Strict(mapper, images) if schedule == "strict" else Overlapped(mapper, images)
 
@@ -96,7 +97,7 @@ def new_scheduler(schedule: str, mapper: Mapper, images: ImagePool) -> Scheduler
 class Strict:
     """Tracking waits for mapping: the same input gives the same bytes."""
 
-    def __init__(self, mapper: Mapper, images: ImagePool) -> None:
+    def __init__(self, mapper: MapOptimizer, images: ImagePool) -> None:
         self.mapper, self.images = mapper, images
         self._finished: tuple[int, MappingResult] | None = None
 
@@ -127,7 +128,7 @@ class Overlapped:
     version: Tasks that are in it.
     """
 
-    def __init__(self, mapper: Mapper, images: ImagePool) -> None:
+    def __init__(self, mapper: MapOptimizer, images: ImagePool) -> None:
         self.mapper, self.images = mapper, images
         self.scene = mapper.scene
         self.version = 0

@@ -6,6 +6,7 @@ import numpy as np
 
 from warpslam.camera import Intrinsics
 from warpslam.runtime.phases import phase
+from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe, overlap_fractions
 
 
@@ -45,6 +46,33 @@ def random_window(keyframes: list[Keyframe], size: int, rng: np.random.Generator
         return []
     *candidates, last = keyframes
     return [*_some(candidates, size - 2, rng), last]
+
+
+@phase("keyframe selection")
+def replayed_keyframes(
+    keyframes: list[Keyframe],
+    count: int,
+    rng: np.random.Generator,
+    images: ImagePool,
+    T_world_camera: np.ndarray,
+    camera: Intrinsics,
+) -> list[Keyframe]:
+    """``count`` random ones of the keyframes that see a tenth of what the current frame sees, in turn where there are
+    fewer; none if there are none.
+    """
+    if not keyframes or not count:
+        return []
+    poses = [keyframe.pose for keyframe in keyframes]
+    fractions = overlap_fractions(images.current_depth(), T_world_camera, poses, camera, rng)
+    return random_keyframes([one for one, share in zip(keyframes, fractions, strict=True) if share > 0.1], count, rng)
+
+
+def random_keyframes(keyframes: list[Keyframe], count: int, rng: np.random.Generator) -> list[Keyframe]:
+    """``count`` keyframes in random order, in turn where there are fewer; none if there are none."""
+    if not keyframes:
+        return []
+    order = rng.permutation(len(keyframes))
+    return [keyframes[order[n % len(order)]] for n in range(count)]
 
 
 def _some(keyframes: list[Keyframe], count: int, rng: np.random.Generator) -> list[Keyframe]:

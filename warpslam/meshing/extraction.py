@@ -17,15 +17,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, Protocol
 
 import numpy as np
 import trimesh
+import warp as wp
 
 from warpslam.errors import InputError, MeshError
 from warpslam.meshing.cleaning import Hull, face_vectors, keep_faces, piece_areas, vertex_normals
 from warpslam.meshing.marching_cubes import Surface, all_corners, touched_points
 from warpslam.meshing.views import Evidence
+from warpslam.runtime.environment import free_gigabytes
 from warpslam.runtime.phases import phase
 from warpslam.scene.mapped_views import ObservedView
 
@@ -47,6 +50,8 @@ _MEASURED_SHARE = 0.5
 _SEEN, _FORECAST = 0, 1
 _BLOCK_CELLS = 64
 _QUERY_CHUNK = 131072
+_MAX_BLOCKS = 100_000  # of _BLOCK_CELLS cubed cells each: an hour or so
+_MIN_FREE = 0.25  # [GB]
 
 
 class Field(Protocol):
@@ -119,6 +124,12 @@ def extract_mesh(
     blocks = list(_blocks(lo, hi, block_cells, evidence, hull, voxel))
     for done, block in enumerate(blocks):
         _mesh_block(scene, block, evidence, surface, voxel, level_set, found)
+        free = free_gigabytes(wp.get_device("cpu")) if done % 16 == 15 else None
+        if free is not None and free < _MIN_FREE:
+            raise InputError(
+                f"voxel = {voxel:g} m: memory runs out ({free:.2f} GB left) after {done + 1} of {len(blocks)} blocks: "
+                "use a larger one"
+            )
         if progress is not None:
             progress(done + 1, len(blocks))
     if found.observed_count == 0:
@@ -272,8 +283,14 @@ def _lattice_range(scene: Field, evidence: Evidence, voxel: float) -> tuple[np.n
     scene_lo, scene_hi = (np.asarray(corner, dtype=np.float64) for corner in scene.bounds)
     if scene_lo.shape != (3,) or scene_hi.shape != (3,) or np.isnan([scene_lo, scene_hi]).any():
         raise MeshError(f"scene.bounds = {_text(scene.bounds)} must be two points of three numbers [m]")
-    lo = np.ceil(np.maximum(scene_lo, evidence.lo) / voxel).astype(np.int64)
-    hi = np.floor(np.minimum(scene_hi, evidence.hi) / voxel).astype(np.int64)
+    low, high = np.maximum(scene_lo, evidence.lo), np.minimum(scene_hi, evidence.hi)
+    blocks = np.prod(np.maximum(high - low, 0.0) / (voxel * _BLOCK_CELLS) + 1.0)  # before anything becomes an integer
+    if not blocks <= _MAX_BLOCKS:
+        raise InputError(
+            f"voxel = {voxel:g} m cuts {_text(np.maximum(high - low, 0.0))} m into {blocks * _BLOCK_CELLS**3:.2g} "
+            f"cells, more than {_MAX_BLOCKS * _BLOCK_CELLS**3:.2g}: use a larger one"
+        )
+    lo, hi = np.ceil(low / voxel).astype(np.int64), np.floor(high / voxel).astype(np.int64)
     if (hi <= lo).any():
         raise MeshError(
             f"no lattice point was observed: the scene bounds {_text(scene.bounds)} hold no cell of {voxel} m within "
@@ -341,6 +358,8 @@ def _check_arguments(
         ("behind_surface", behind, True),
         ("band", 1.0 if band is None else band, False),
     ):
+        if isinstance(value, bool) or not isinstance(value, Real) or abs(value) > 1e300:
+            raise InputError(f"{name} = {value!r} must be a number that is not absurd")
         if not np.isfinite(value) or value < 0 or (value == 0 and not low_ok):
             raise InputError(f"{name} = {value!r} must be a finite number {'of at least' if low_ok else 'above'} 0")
     if not np.isfinite(level_set):

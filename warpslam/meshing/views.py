@@ -18,6 +18,7 @@ import warp as wp
 from warpslam.camera import Intrinsics
 from warpslam.errors import InputError, MeshError
 from warpslam.kernels.visibility import NEAR, Views, classify_points, find_facing, find_reached
+from warpslam.runtime.environment import named_device
 from warpslam.scene.mapped_views import ObservedView
 
 # The reference enlarges images by 1000 px; in focal lengths of its Replica camera (600 px), as images have many sizes.
@@ -41,7 +42,7 @@ class Evidence:
         views = [view for view in views if view.depth.any()]
         if not views:
             raise MeshError("no view with depth to mesh from; pass the keyframes of a sequence that has been mapped")
-        self.device = wp.get_device(device)
+        self.device = named_device(device)
         self.behind, self.band = behind, band
         self.max_behind = _MAX_BEHIND_ALONG_Z * behind
         self.max_front = _MAX_FRONT_ALONG_Z * band

@@ -79,8 +79,8 @@ class SavedRun:
         slices = self.state[0].get("slices")
         if slices != slice_count(slam.device):
             log.warning(
-                "the run was started on %s CPU cores and goes on with %d: sums are formed in another order, so the "
-                "result will not be the same to the bit", slices, slice_count(slam.device),
+                "the run was started with WARPSLAM_SLICES=%s and goes on with %d: sums are formed in another order, so "
+                "the result will not be the same to the bit", slices, slice_count(slam.device),
             )  # fmt: skip
         return slam
 
@@ -179,13 +179,13 @@ def read_checkpoint(folder: RunFolder) -> SavedRun:
     Raises:
         CheckpointError: There is none; says what is wrong with each.
     """
+    folder.finish_taking_place()
     found = [path for path in (folder.checkpoint, folder.previous_checkpoint) if path.exists()]
     if not found:
-        finished = folder.map.exists() and folder.metrics.exists()
-        raise CheckpointError(
-            f"{folder.path} holds no checkpoint: "
-            + ("the run is over" if finished else "start the run again, with --checkpoint-every")
-        )
+        remedy = "start the run again, with --checkpoint-every"
+        if folder.has_results:
+            remedy = f"the run can't go on, but warpslam report {folder.path} makes what is missing of what lies there"
+        raise CheckpointError(f"{folder.path} holds no checkpoint: {remedy}")
     problems = []
     for path in found:
         try:

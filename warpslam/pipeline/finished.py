@@ -2,30 +2,102 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warpslam.errors import DatasetError, InputError
+from warpslam.errors import CheckpointError, ConfigError, DatasetError, InputError, MeshError
 from warpslam.evaluation import (
     DEFAULT_PROTOCOL,
+    ate,
     evaluate_mesh,
     load_mesh,
     reconstruction_metrics,
     rendering_metrics,
     trajectory_metrics,
 )
-from warpslam.pipeline.results import render_panel
+from warpslam.frames import FrameStatus
+from warpslam.meshing import check_mesh_path, write_mesh
+from warpslam.pipeline.results import render_panel, size_of_mesh
 from warpslam.pipeline.setup import as_configured, load_slam, open_source
+from warpslam.poses import transform_poses
+from warpslam.report.plots import plot_error, plot_panels, plot_top_view
 from warpslam.runs.folder import RunFolder
+from warpslam.runs.manifest import note_changed
+from warpslam.runs.metrics import RunMetrics
+from warpslam.runs.record import FINISHED, UNFINISHED, RunRecord
 from warpslam.spread import spread
 from warpslam.storage.json_files import read_json
 from warpslam.storage.tum import associate, read_tum
 
 if TYPE_CHECKING:
     import trimesh
+
+log = logging.getLogger(__name__)
+
+
+def is_finished(folder: RunFolder) -> bool:
+    """Whether a run has come to its end and all it wrote is there.
+
+    Raises:
+        DatasetError: Its figures are damaged.
+    """
+    folder.finish_taking_place()
+    if not folder.metrics.is_file() or folder.is_unfinished:
+        return False
+    return RunMetrics.read(folder.metrics).status == FINISHED
+
+
+def complete(folder: RunFolder, device: str | None = None) -> list[str]:
+    """Make what is missing in the folder of a run that was ended on its last metres, of what lies there.
+
+    Its mesh comes from its map, figures of the trajectory from the trajectory, plots from both.
+
+    Returns:
+        What was made, for the user.
+    """
+    if folder.is_unfinished or not folder.trajectory.is_file():
+        return []
+    made = []
+    metrics = RunMetrics.read(folder.metrics) if folder.metrics.is_file() else RunMetrics()
+    if metrics.status == FINISHED:
+        return []
+    times, poses = read_tum(folder.trajectory, leave_out_unknown=True)
+    record, error, truth = RunRecord(), None, None
+    if folder.ground_truth.is_file():
+        truth_times, truth_poses = read_tum(folder.ground_truth)
+        partner = associate(times, truth_times, 1e-6)
+        truth = np.where((partner >= 0)[:, None, None], truth_poses[partner], np.nan)
+    if metrics.status is None:
+        facts = {"sequence": folder.path.name, "status": UNFINISHED, "frames": {"processed": len(times)}}
+        metrics.fill(facts)
+    try:
+        if truth is not None:
+            error = ate(poses, truth)
+            metrics.fill(trajectory_metrics(poses, truth))
+    except InputError as reason:
+        log.info("no trajectory error: %s", reason)
+    if folder.map.is_file() and not folder.mesh.is_file():
+        try:
+            mesh = load_slam(folder, device).mesh()
+            write_mesh(mesh, folder.mesh)
+            metrics.fill({"mesh": size_of_mesh(mesh)})
+            made.append(folder.mesh.name)
+        except (MeshError, CheckpointError, ConfigError) as reason:
+            log.warning("no mesh: %s", reason)
+    if not folder.top_view.is_file():
+        shown = poses if error is None else transform_poses(error.T_truth_estimate, poses)
+        status = [FrameStatus.OK] * len(poses)
+        plot_top_view(folder.top_view, shown, None if error is None else truth, status)
+        plot_error(folder.error_plot, times, error, record.losses, status)
+        made.append(folder.top_view.name)
+    if made or not folder.metrics.is_file():
+        metrics.write(folder.metrics)
+        made.append(folder.metrics.name)
+    return made
 
 
 def evaluate_run(
@@ -107,8 +179,6 @@ def render_frame(folder: RunFolder, index: int, output: str | Path | None = None
         InputError: The run has no pose for the frame.
         DatasetError: The input or a file of the run is missing.
     """
-    from warpslam.report.plots import plot_panels
-
     _, poses = read_tum(folder.require(folder.trajectory, "the run stopped before its first frame"))
     sequence = open_source(folder.read_source())
     if not 0 <= index < len(sequence):
@@ -148,14 +218,14 @@ def extract_mesh(
         InputError: The map can't be refined.
         MeshError: There is no surface, or the file can't be written.
     """
-    from warpslam.meshing import check_mesh_path, write_mesh
-
     path = check_mesh_path(output if output is not None else folder.forecast_mesh if forecast else folder.mesh)
     slam = load_slam(folder, device)
     if refinement_rounds > 0:
         slam.refine(refinement_rounds)
     mesh = slam.mesh(voxel, forecast=forecast)
-    return mesh, write_mesh(mesh, path)
+    written = write_mesh(mesh, path)
+    note_changed(folder, written)
+    return mesh, written
 
 
 def _frame_indices(folder: RunFolder, count: int) -> list[int]:

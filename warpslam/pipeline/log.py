@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from warpslam.errors import printable
+
 log = logging.getLogger(__name__)
 
 
@@ -33,12 +35,20 @@ class LogFile(logging.FileHandler):
             log.warning("%s: the last lines can't be written (%s)", self.baseFilename, error.strerror)
 
 
+class OneRecord(logging.Formatter):
+    """Control characters are escaped, and lines after the first are set in: no name of a file can forge a record."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """As `logging` has it."""
+        return printable(super().format(record)).replace("\n", "\n    ")
+
+
 @contextmanager
 def log_file(path: Path, *, append: bool = False) -> Iterator[None]:
     """Send everything that warpslam logs, from INFO up, to a file as well."""
     logger = logging.getLogger("warpslam")
     handler = LogFile(path, logger, append=append)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    handler.setFormatter(OneRecord("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     level = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)

@@ -58,6 +58,8 @@ class FrameLoop:
 
     checkpoints: Checkpoints
     observer: Observer
+    _next_ate: int = 0
+    _ate: float | None = None
 
     def run(self) -> None:
         """Process the frames that are left.
@@ -120,10 +122,12 @@ class FrameLoop:
         return truth if self.world_is_known and np.isfinite(truth).all() else None
 
     def _progress(self, result: FrameResult, fps: float) -> Progress:
-        record, rmse = self.record, None
-        if record.has_truth:
-            rmse = ate(trajectory_of(self.slam, record).poses, record.truth).rmse
-        return Progress(len(record.results) + len(record.left_out), len(self.selected), result, rmse, fps)
+        record, done = self.record, len(self.record.results)
+        # Of all poses so far, and so dearer by the frame: asked anew when there are a twentieth more, and at the end.
+        if done >= self._next_ate or record.position == len(self.selected):
+            self._next_ate = done + 1 + done // 20
+            self._ate = ate(trajectory_of(self.slam, record).poses, record.truth).rmse if record.has_truth else None
+        return Progress(done + len(record.left_out), len(self.selected), result, self._ate, fps)
 
     def _check_that_one_was_used(self) -> None:
         name, results = self.sequence.name, self.record.results

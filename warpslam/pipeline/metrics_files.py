@@ -89,7 +89,7 @@ def write_timing(folder: RunFolder, record: RunRecord, modules: Sequence[ModuleP
 def write_frames(folder: RunFolder, record: RunRecord) -> None:
     """What became of each frame: all of it for the report, and a table of it."""
     write_json(folder.frame_records, record.to_rows())
-    with open(folder.frames, "w", newline="", encoding="utf-8") as file:
+    with open(folder.frames, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         writer = csv.writer(file, lineterminator="\n")
         columns = ["inliers", "depth_error_m", "correlation", "sigma_m", "sigma_deg"]
         writer.writerow(["frame", "timestamp", "status", *columns, "message"])

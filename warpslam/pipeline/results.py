@@ -95,11 +95,11 @@ def evaluate_trajectory(trajectory: Trajectory, record: RunRecord, metrics: RunM
 
 def write_map(folder: RunFolder, slam: Method, record: RunRecord, metrics: RunMetrics) -> None:
     """Write the map, and note what it takes and what it holds."""
-    with record.clock("saving"):
-        slam.save(folder.map)
     metrics.fill({"map": {"bytes": slam.map_bytes, "flops_per_point": slam.flops_per_point}})
     with record.clock("inventory"):
         metrics.fill(slam.inventory())
+    with record.clock("saving"):
+        slam.save(folder.map)
 
 
 def extract_and_write_mesh(folder: RunFolder, slam: Method, record: RunRecord, metrics: RunMetrics) -> None:
@@ -109,11 +109,17 @@ def extract_and_write_mesh(folder: RunFolder, slam: Method, record: RunRecord, m
             mesh = slam.mesh()
             write_mesh(mesh, folder.mesh)
     except MeshError as error:
-        log.error("no mesh: %s", error)
         metrics.fill({"mesh": {"error": str(error)}})
+        if isinstance(error.__cause__, OSError):  # it is no matter of the map that the disk is full
+            raise
+        log.error("no mesh: %s", error)
         return
-    size = {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "area_m2": float(mesh.area)}
-    metrics.fill({"mesh": size})
+    metrics.fill({"mesh": size_of_mesh(mesh)})
+
+
+def size_of_mesh(mesh: trimesh.Trimesh) -> dict[str, float]:
+    """As metrics.json has it."""
+    return {"vertices": len(mesh.vertices), "faces": len(mesh.faces), "area_m2": float(mesh.area)}
 
 
 def evaluate_reconstruction(

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from warpslam.errors import ConfigError, DatasetError, WarpSlamError
+from warpslam.errors import (
+    CheckpointError,
+    ConfigError,
+    DatasetError,
+    MapSizeError,
+    MeshError,
+    OutputError,
+    WarpSlamError,
+)
 from warpslam.pipeline.checkpoints import Checkpoints, SavedRun, find_checkpoint
 from warpslam.pipeline.log import log_file
 from warpslam.pipeline.loop import FrameLoop
@@ -32,6 +40,8 @@ from warpslam.pipeline.results import (
 from warpslam.pipeline.setup import (
     as_configured,
     build_slam,
+    check_device,
+    check_map,
     load_kernels,
     open_map,
     open_source,
@@ -41,11 +51,14 @@ from warpslam.pipeline.setup import (
 from warpslam.report import write_report
 from warpslam.runs.folder import RunFolder
 from warpslam.runs.given_poses import GivenPoses
+from warpslam.runs.manifest import write_manifest
 from warpslam.runs.metrics import RunMetrics
-from warpslam.runs.record import FAILED, FINISHED, INTERRUPTED, RunRecord, RunResult
+from warpslam.runs.record import FAILED, FINISHED, INTERRUPTED, UNFINISHED, RunRecord, RunResult
 from warpslam.runs.request import RunRequest, SequenceFacts
 from warpslam.runtime.kernel_cache import kernel_cache_errors
 from warpslam.sequences.checking import ERROR, OK, check_sequence
+from warpslam.storage.atomic import sync_folder
+from warpslam.storage.locked_folder import locked
 from warpslam.storage.writing import output_error
 
 if TYPE_CHECKING:
@@ -71,12 +84,14 @@ def run(
     saved: SavedRun | None = None,
     go_on: bool = False,
     check_input: bool = True,
+    overwrite: bool = False,
+    discard: bool = False,
 ) -> RunResult:
     """Run SLAM over a sequence and write a run folder.
 
     Args:
         request: What is asked for.
-        output: Folder to write; None for ``runs/<sequence>/<time>``.
+        output: Folder to write; None for ``runs/<sequence>/<time>``. Nobody else may write into it meanwhile.
         sequence: Input; None to open that of the request.
         truth_mesh: True surface in the world frame of the sequence; None for that of the request.
         observer: Told of every frame, and of every module of kernels.
@@ -85,6 +100,9 @@ def run(
             a warning says why, and the run starts from the beginning.
         check_input: Refuse an input that `warpslam.sequences.checking` finds can't work; its warnings
             are logged in any case.
+        overwrite: ``output`` may hold a run: the new one is written beside it (``next_run`` in its folder) and takes
+            its place when it is finished. With ``go_on`` it always may.
+        discard: With ``overwrite``, a run that was stopped while it grew there is given up.
 
     Raises:
         WarpSlamError: The input or a setting can't be used, or a result can't be written. metrics.json is written even
@@ -95,30 +113,42 @@ def run(
         if request.source is None:
             raise ConfigError("the request has no source: name one, or hand over a sequence")
         sequence = open_source(request.source)
+    # Whatever can be wrong with what is asked for is found before anything is written.
+    check_device(request.device)
     request = resolve(request, sequence)
     sequence = as_configured(sequence, request.config)
     truth_mesh = true_surface(request, sequence) if truth_mesh is None else truth_mesh
+    given = None if request.poses is None else GivenPoses.read(request.poses)
+    check_map(request.map)
     observer.begin(sequence.name)
     why_anew = ""
+    folder = None if output is None else RunFolder(output)
     if saved is not None:
         saved.check(request, sequence)
-    elif go_on and has_checkpoints(request.method) and output is not None:
-        saved, why_anew = find_checkpoint(RunFolder(output), request, sequence)
+    elif go_on and folder is not None and has_checkpoints(request.method):
+        for candidate in (folder, folder.successor):
+            folder = candidate
+            saved, why = find_checkpoint(folder, request, sequence)
+            why_anew = why_anew or why
+            if saved is not None:
+                why_anew = ""
+                break
     if saved is None:
-        folder = RunFolder.create(output, sequence.name)
-    else:
-        assert output is not None
-        folder = RunFolder(output)
-        folder.clear_results()
-    with log_file(folder.log, append=saved is not None):
-        given = None if request.poses is None else GivenPoses.read(request.poses)
+        folder = RunFolder.create(output, sequence.name, overwrite=overwrite or go_on, discard=discard or go_on)
+    assert folder is not None
+    with locked(folder.path), log_file(folder.log, append=saved is not None):
         under_way = Run(request, sequence, folder, truth_mesh, given, observer, saved, check_input)
         if why_anew:
             under_way.metrics.started_anew = why_anew
             log.warning("starting from the beginning: %s", why_anew)
         result = under_way.execute()
-        observer.done(result)
-        return result
+    if result.status == FINISHED:
+        try:
+            result = replace(result, folder=folder.take_place())
+        except OSError as error:
+            raise output_error(error, folder.path) from error
+    observer.done(result)
+    return result
 
 
 @dataclass(eq=False)
@@ -158,6 +188,8 @@ class Run:
     modules: list[ModuleProgress] = field(default_factory=list)
     """Modules of kernels that were loaded."""
 
+    _marks: dict[str, tuple[int, int]] = field(default_factory=dict)
+    _unwritten: Exception | None = None
     slam: Method | None = None
     ate: AteResult | None = None
     reconstruction: ReconstructionResult | None = None
@@ -172,7 +204,8 @@ class Run:
             self.metrics.resumed_after = self.record.position
 
     def execute(self) -> RunResult:
-        """All steps, one after the other. Whatever ends them, what there is by then is written."""
+        """All steps, one after the other. Whatever ends them, what there is by then is written; checkpoints go last."""
+        self._marks = self.folder.marks()
         try:
             with self.record.clock("total"):
                 with self._interruptible():
@@ -183,8 +216,6 @@ class Run:
                     self._finish_map()
                 if self.record.results:
                     self._write_results()
-            if self.status == FINISHED:
-                self.folder.remove_checkpoints()
         except KeyboardInterrupt:
             self.status = INTERRUPTED
         except OSError as error:
@@ -195,7 +226,19 @@ class Run:
             raise
         finally:
             self._write_account()
+        if self.status == FINISHED:
+            self._close()
         return RunResult(self.folder, self.status, self.metrics, self.ate, self.reconstruction)
+
+    def _close(self) -> None:
+        """Everything is there: what is not of this run goes, and what the run could go on from at the very last."""
+        try:
+            self.folder.remove_stale(self._marks)
+            write_manifest(self.folder)
+            sync_folder(self.folder.path)
+            self.folder.remove_checkpoints()
+        except OSError as error:
+            raise output_error(error, self.folder.path) from error
 
     @property
     def config(self) -> Config:
@@ -281,24 +324,40 @@ class Run:
             self.record.seconds[f"finish_{phase}"] += seconds
 
     def _write_results(self) -> None:
-        """All that needs the map."""
+        """All that needs the map: what is small first, and nothing waits for what does not fit on the disk."""
         assert self.slam is not None
         folder, slam, record, metrics = self.folder, self.slam, self.record, self.metrics
         trajectory = trajectory_of(slam, record)
-        write_trajectory(folder, trajectory, record)
+        self._attempt(lambda: write_trajectory(folder, trajectory, record))
         self.ate = evaluate_trajectory(trajectory, record, metrics)
-        write_map(folder, slam, record, metrics)
+        self._attempt(lambda: self._write_figures(UNFINISHED))  # `warpslam report` goes by them if the rest never comes
+        self._attempt(lambda: write_map(folder, slam, record, metrics))
         if not self._makes_map:
             log.info("mapping.enabled is off: there is a trajectory, and no map to make a mesh of")
             metrics.fill({"mesh": {"error": "mapping.enabled is off"}})
-            draw_plots(folder, trajectory, self.ate, record)
-            return
-        extract_and_write_mesh(folder, slam, record, metrics)
-        self.reconstruction = evaluate_reconstruction(
-            folder, self.truth_mesh, self.sequence, trajectory, record, metrics, self.request.device
-        )
-        draw_plots(folder, trajectory, self.ate, record)
-        draw_panels(folder, slam, self.sequence, trajectory, record, metrics)
+            self._attempt(lambda: draw_plots(folder, trajectory, self.ate, record))
+        else:
+            self._attempt(lambda: extract_and_write_mesh(folder, slam, record, metrics))
+            self.reconstruction = evaluate_reconstruction(
+                folder, self.truth_mesh, self.sequence, trajectory, record, metrics, self.request.device
+            )
+            self._attempt(lambda: draw_plots(folder, trajectory, self.ate, record))
+            self._attempt(lambda: draw_panels(folder, slam, self.sequence, trajectory, record, metrics))
+        if self._unwritten is not None:
+            raise self._unwritten
+
+    def _attempt(self, write: Callable[[], None]) -> None:
+        """Write something; the first error that its place on the disk is to blame for is raised when all was tried."""
+        try:
+            write()
+        except (OSError, OutputError, CheckpointError) as error:
+            remove_leftovers(self.folder)
+            log.error("%s", output_error(error, self.folder.path) if isinstance(error, OSError) else error)
+            self._unwritten = self._unwritten or error
+        except MeshError as error:
+            if not isinstance(error.__cause__, OSError):
+                raise
+            self._unwritten = self._unwritten or error
 
     @property
     def _makes_map(self) -> bool:
@@ -317,14 +376,14 @@ class Run:
                 raise output_error(error, self.folder.path) from error
             log.error("%s", output_error(error, self.folder.path))
 
-    def _write_figures(self) -> None:
+    def _write_figures(self, status: str | None = None) -> None:
         request, checkpoints = self.request, self.checkpoints
         self.metrics.fill(
             {
                 "sequence": self.sequence.name,
                 "method": request.method,
                 "poses": None if self.given is None else self.given.path,
-                "status": self.status,
+                "status": status or self.status,
                 "device": request.device if self.slam is None else str(self.slam.device),
                 "seed": request.seed,
                 "started": self.started.isoformat(timespec="seconds"),
@@ -353,10 +412,17 @@ class Run:
             log.exception("no report")
 
     def _fail(self, error: Exception) -> None:
-        """Note the failure, and save the trajectory if that has not happened yet."""
+        """Note the failure, and save what is worth it and was not saved yet: the map where it only must not grow."""
         self.status = FAILED
         self.metrics.error = f"{type(error).__name__}: {error}"
         log.exception("the run failed")
         remove_leftovers(self.folder)
-        if self.record.results and self.slam is not None and not self.folder.trajectory.exists():
+        if not self.record.results or self.slam is None:
+            return
+        if isinstance(error, MapSizeError) and self._makes_map:
+            try:
+                self._write_results()
+            except Exception as second:
+                log.error("what there is can't be written: %s", second)
+        elif self.folder.marks().get("trajectory.tum") == self._marks.get("trajectory.tum"):
             rescue_trajectory(self.folder, trajectory_of(self.slam, self.record), self.record)

@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from warpslam.camera import ONE_MOMENT, Intrinsics, SensorTiming
-from warpslam.errors import ConfigError, InputError
+from warpslam.errors import CheckpointError, ConfigError, InputError
 from warpslam.evaluation import load_mesh
 from warpslam.pipeline.methods import build_method, check_method, has_checkpoints, load_method
 from warpslam.runs.folder import RunFolder
 from warpslam.runs.metrics import RunMetrics
 from warpslam.runs.request import DEFAULT_METHOD, RunRequest, Source
 from warpslam.runtime.compilation import ModuleProgress, compile_kernels
+from warpslam.runtime.environment import named_device
+from warpslam.runtime.kernel_cache import kernel_cache_errors
 from warpslam.sequences import open_sequence
 from warpslam.slam import Slam
 from warpslam.slam_state import saved_config
@@ -109,9 +111,18 @@ def check_device(device: str | None) -> None:
     Raises:
         ConfigError: It has not.
     """
-    names = [str(known) for known in wp.get_devices()]
-    if device is not None and device not in (*names, "cuda"):
-        raise ConfigError(f"device {device!r} is not there; this machine has {', '.join(names)}")
+    with kernel_cache_errors():
+        named_device(device)
+
+
+def check_map(path: str | Path | None) -> None:
+    """Whether a map that a run is to start from is there; what is in it is looked at when it is loaded.
+
+    Raises:
+        CheckpointError: It is not.
+    """
+    if path is not None and not Path(path).is_file():
+        raise CheckpointError(f"{path}: no such file; name the map of a run, or its folder")
 
 
 def device_name(device: str | None) -> str:

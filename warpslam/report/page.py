@@ -130,7 +130,8 @@ def write_page(content: Html, path: str | Path) -> Path:
     path = Path(path)
     try:
         with replacing(path) as partial:
-            partial.write_text(content, encoding="utf-8")
+            # Names of files need not be UTF-8.
+            partial.write_text(content, encoding="utf-8", errors="backslashreplace")
     except OSError as error:
         raise ConfigError(f"report {path} can't be written ({error.strerror}); choose another file with -o") from error
     return path

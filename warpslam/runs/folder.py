@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import tempfile
 from dataclasses import asdict
 from datetime import datetime
@@ -11,11 +12,12 @@ from pathlib import Path
 from warpslam.config import Config
 from warpslam.errors import ConfigError, DatasetError
 from warpslam.runs.request import Source
+from warpslam.storage.atomic import sync_folder
 from warpslam.storage.json_files import read_json, write_json
 
-# Removed before a run writes into a folder that an earlier run used: a stale mesh beside a new trajectory misleads.
-_WRITTEN_FILES = (
+WRITTEN_FILES = (
     "checkpoint.next.safetensors",
+    "checkpoint.other.safetensors",
     "checkpoint.previous.safetensors",
     "checkpoint.safetensors",
     "config.yaml",
@@ -25,6 +27,7 @@ _WRITTEN_FILES = (
     "ground_truth.tum",
     "input.json",
     "log.txt",
+    "manifest.json",
     "map.safetensors",
     "mesh.ply",
     "mesh_forecast.ply",
@@ -36,8 +39,22 @@ _WRITTEN_FILES = (
     "trajectory.tum",
     "trajectory_top_view.png",
 )
+"""All that a run writes into its folder."""
+
 _MARKS_OF_A_RUN = ("metrics.json", "checkpoint.safetensors", "checkpoint.previous.safetensors")
+# A folder without any of these holds nothing that took time to compute.
+_RESULTS = (
+    "checkpoint.other.safetensors",
+    "checkpoint.previous.safetensors",
+    "checkpoint.safetensors",
+    "map.safetensors",
+    "mesh.ply",
+    "trajectory.tum",
+)
 _KEPT_TO_RESUME = ("checkpoint.previous.safetensors", "checkpoint.safetensors", "config.yaml", "input.json", "log.txt")
+NEXT = "next_run"
+"""Folder in that of a run in which its successor grows."""
+_WHOLE = "whole"  # file in NEXT: the successor is whole, and takes the place of the run
 
 
 class RunFolder:
@@ -77,35 +94,109 @@ class RunFolder:
         self.panel_images = self.path / "panels.npz"
         """The images of that figure as arrays."""
         self.report = self.path / "report.html"
+        self.manifest = self.path / "manifest.json"
+        """Sizes and check sums of the others; see `warpslam.runs.manifest`."""
 
     @classmethod
-    def create(cls, path: str | Path | None, name: str, root: str | Path = "runs") -> RunFolder:
-        """Make the folder of a new run.
+    def create(
+        cls,
+        path: str | Path | None,
+        name: str,
+        root: str | Path = "runs",
+        *,
+        overwrite: bool = False,
+        discard: bool = False,
+    ) -> RunFolder:
+        """Make the folder of a new run. Nothing that an earlier run computed is removed here, but what `discard` names.
 
         Args:
-            path: Folder to write to; what an earlier run wrote there is removed. None makes ``root/name/<time>`` and
-                points ``root/name/latest`` at it.
+            path: Folder to write to. None makes ``root/name/<time>`` and points ``root/name/latest`` at it.
             name: Name of the sequence.
             root: Folder of all runs.
+            overwrite: Where ``path`` holds a run, the new one grows in a folder within, and takes its place by
+                `take_place` when it is whole.
+            discard: A successor that grew there before, and was stopped, is given up.
 
         Raises:
-            ConfigError: The folder can't be made.
+            ConfigError: The folder can't be made, or holds a run that is not to be overwritten.
         """
-        folder = Path(path) if path is not None else _free_name(Path(root) / as_file_name(name))
+        folder = cls(path if path is not None else _free_name(Path(root) / as_file_name(name)))
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            if any((folder / name).exists() for name in _MARKS_OF_A_RUN):
-                for file in _WRITTEN_FILES:
-                    (folder / file).unlink(missing_ok=True)
+            folder.path.mkdir(parents=True, exist_ok=True)
+            folder.finish_taking_place()
+            if folder.has_results:
+                if not overwrite:
+                    raise ConfigError(folder._what_to_do())
+                folder = folder.successor
+                if folder.is_unfinished and not discard:
+                    raise ConfigError(folder._what_to_do())
+                folder.path.mkdir(exist_ok=True)
+            if any((folder.path / name).exists() for name in _MARKS_OF_A_RUN):
+                for file in WRITTEN_FILES:
+                    (folder.path / file).unlink(missing_ok=True)
             # Now, not after an hour of work: a folder that is there need not be one that can be written to.
-            with tempfile.TemporaryFile(dir=folder) as probe:
+            with tempfile.TemporaryFile(dir=folder.path) as probe:
                 probe.write(bytes(4096))
         except OSError as error:
             reason = error.strerror or error
-            raise ConfigError(f"output folder {folder} can't be used ({reason}); choose another one") from error
+            raise ConfigError(f"output folder {folder.path} can't be used ({reason}); choose another one") from error
         if path is None:
-            _point_latest(folder)
-        return cls(folder)
+            _point_latest(folder.path)
+        return folder
+
+    @property
+    def has_results(self) -> bool:
+        """Whether a run has computed something that lies here."""
+        return any((self.path / name).exists() for name in _RESULTS)
+
+    @property
+    def successor(self) -> RunFolder:
+        """Where the run grows that is to take this one's place."""
+        return RunFolder(self.path / NEXT)
+
+    @property
+    def is_unfinished(self) -> bool:
+        """Whether there is a checkpoint to go on from."""
+        return self.checkpoint.exists() or self.previous_checkpoint.exists()
+
+    def _what_to_do(self) -> str:
+        if self.is_unfinished:
+            other = "replace it, when the new one is whole, by --overwrite"
+            if self.path.name == NEXT:
+                other = "remove that folder"
+            return f"{self.path} holds an unfinished run: go on with it by --resume {self.path}, or {other}"
+        return f"{self.path} holds the results of a run: choose another folder, or replace them by --overwrite"
+
+    def take_place(self) -> RunFolder:
+        """Where this is the successor of a run, and whole: have it take the run's place; returns where it is then.
+
+        A stop at any moment loses nothing: what is left to do is done by `finish_taking_place`.
+        """
+        if self.path.name != NEXT or not self.path.parent.is_dir():
+            return self
+        (self.path / _WHOLE).touch()
+        sync_folder(self.path)
+        folder = RunFolder(self.path.parent)
+        folder.finish_taking_place()
+        return folder
+
+    def finish_taking_place(self) -> None:
+        """Move a whole successor here, if there is one."""
+        new = self.path / NEXT
+        if not (new / _WHOLE).is_file():
+            return
+        # What came with the one before goes only when all of the new one is here.
+        moved = [name for name in WRITTEN_FILES if (new / name).is_file()]
+        stale = new / "stale.json"
+        if not stale.is_file():
+            write_json(stale, {"files": [name for name in WRITTEN_FILES if name not in moved]})
+        for name in moved:
+            (new / name).replace(self.path / name)
+        listed = read_json(stale).get("files")
+        for name in listed if isinstance(listed, list) else ():
+            if name in WRITTEN_FILES:
+                (self.path / name).unlink(missing_ok=True)
+        shutil.rmtree(new)
 
     @classmethod
     def open(cls, path: str | Path) -> RunFolder:
@@ -115,18 +206,45 @@ class RunFolder:
             DatasetError: There is no run in ``path``.
         """
         folder = cls(path)
-        if not folder.metrics.is_file():
-            raise DatasetError(f"{path} is no run folder: it has no metrics.json; pass what 'warpslam run -o' wrote")
+        try:
+            folder.finish_taking_place()
+        except OSError as error:
+            raise DatasetError(f"{error.filename or path}: can't be moved ({error.strerror or error})") from error
+        if not (folder.metrics.is_file() or folder.trajectory.is_file()):
+            raise DatasetError(
+                f"{path} is no run folder: it has neither metrics.json nor trajectory.tum; pass what 'warpslam run -o' "
+                "wrote"
+            )
         return folder
 
-    def clear_results(self) -> None:
-        """Remove what a run that stopped early wrote at its end, before it goes on."""
-        for name in set(_WRITTEN_FILES) - set(_KEPT_TO_RESUME):
-            (self.path / name).unlink(missing_ok=True)
+    def marks(self) -> dict[str, tuple[int, int]]:
+        """By which `remove_stale` knows the files that were not written anew."""
+        found = {}
+        for name in WRITTEN_FILES:
+            with contextlib.suppress(OSError):
+                stat = (self.path / name).stat()
+                found[name] = stat.st_ino, stat.st_mtime_ns
+        return found
+
+    def remove_stale(self, marks: dict[str, tuple[int, int]]) -> None:
+        """Remove results of before that a run did not write again: they belong to an earlier stop of it."""
+        now = self.marks()
+        for name in set(now) - set(_KEPT_TO_RESUME):
+            if now[name] == marks.get(name):
+                (self.path / name).unlink(missing_ok=True)
+
+    def set_checkpoints_aside(self) -> None:
+        """No run goes on from what lies here, but it stays until another run is whole."""
+        other = self.path / "checkpoint.other.safetensors"
+        for path in (self.previous_checkpoint, self.checkpoint):
+            if path.exists():
+                path.replace(other)
+        self.successor.remove_checkpoints()
 
     def remove_checkpoints(self) -> None:
         """Remove what a run could go on from; once it is over, its map holds all that they do."""
-        for path in (self.checkpoint, self.previous_checkpoint):
+        names = ("checkpoint.next.safetensors", "checkpoint.other.safetensors")
+        for path in (*(self.path / name for name in names), self.previous_checkpoint, self.checkpoint):
             path.unlink(missing_ok=True)
 
     def require(self, file: Path, remedy: str) -> Path:

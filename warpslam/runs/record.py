@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 UNREADABLE = "unreadable"
 FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
 """How a run ended. After ctrl-C everything up to then is written."""
+UNFINISHED = "unfinished"
+"""Figures of a run that has not come to its end, or was ended before it could say how."""
 
 # Beside its number in the sequence; the other fields of a result are in timing.json and trajectory.tum.
 _ROW_FIELDS = ("timestamp", "status", "message", "inliers", "depth_error", "correlation", "covariance", "losses")
@@ -244,7 +246,7 @@ class Progress:
     """Of the last frame."""
 
     ate_rmse: float | None
-    """ATE RMSE so far, aligned [m]; None without ground truth."""
+    """ATE RMSE so far, aligned [m], asked anew with every twentieth more frames; None without ground truth."""
 
     fps: float
     """Frames a second so far, set-up left out."""

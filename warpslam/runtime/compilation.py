@@ -18,6 +18,7 @@ import warp as wp
 
 from warpslam.errors import ConfigError
 from warpslam.runtime.cores import process_cores
+from warpslam.runtime.kernel_cache import check_room
 
 _STAGES = (
     "rays",
@@ -28,12 +29,14 @@ _STAGES = (
     "kernels.losses",
     "kernels.grid",
     "views",
+    "supervision",
     "direct",
     "timing",
     "features",
 )
 _PYTHON_MODULES = {
     "warpslam.rays": ("pixels", "rays", "rejection", "samples"),
+    "warpslam.supervision": ("supervision", "touched_rows"),
     "warpslam.views": ("frustum", "images", "rectify", "seen", "visibility"),
     "warpslam.direct": ("direct.images", "direct.points", "direct.registration"),
     "warpslam.timing": ("direct.timing",),
@@ -134,6 +137,8 @@ def _each(
         with lock:
             if report is not None:
                 report(ModuleProgress(name, len(finished), len(names), compiled=not before))
+        if not before:
+            check_room()
         start = time.perf_counter()
         build(module)
         seconds = time.perf_counter() - start

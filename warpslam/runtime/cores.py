@@ -1,4 +1,4 @@
-"""CPU cores of this process, and into how many slices they cut a launch."""
+"""Into how many slices a launch is cut, and how many CPU cores of this process run them."""
 
 from __future__ import annotations
 
@@ -14,15 +14,30 @@ if TYPE_CHECKING:
     import warp as wp
 
 MAX_SLICES = 8
+DEFAULT_SLICES = 2
 
 
 def slice_count(device: wp.Device) -> int:
-    """Slices of a launch over rays, which is also the number of gradient buffers: the CPU's cores (at most 8), 1 on
-    CUDA.
+    """Slices of a launch over rays, which is also the number of gradient buffers: 1 on CUDA.
+
+    On the CPU it says in which order sums are formed, and so decides the last bits of every result. It must not depend
+    on the machine, or on how many of its cores are to be had: it is `DEFAULT_SLICES` unless WARPSLAM_SLICES says
+    otherwise.
     """
-    if device.is_cuda:
-        return 1
-    return max(1, min(_core_count(), MAX_SLICES))
+    return 1 if device.is_cuda else _cpu_slices()
+
+
+def thread_count() -> int:
+    """Threads that run the slices of a launch: the CPU's cores, or as few as WARPSLAM_THREADS says. Changes no bit."""
+    return max(1, _core_count())
+
+
+@lru_cache(maxsize=1)
+def _cpu_slices() -> int:
+    count = _number("WARPSLAM_SLICES", DEFAULT_SLICES)
+    if count > MAX_SLICES:
+        raise ConfigError(f"environment variable WARPSLAM_SLICES = {count} must be at most {MAX_SLICES}")
+    return count
 
 
 def process_cores() -> list[int]:
@@ -36,9 +51,13 @@ def process_cores() -> list[int]:
 def _core_count() -> int:
     """Cores that this process may use; fewer where several share a machine and WARPSLAM_THREADS says so."""
     cores = len(process_cores())
-    text = os.environ.get("WARPSLAM_THREADS", "")
+    return min(cores, _number("WARPSLAM_THREADS", cores))
+
+
+def _number(variable: str, default: int) -> int:
+    text = os.environ.get(variable, "")
     if not text:
-        return cores
+        return default
     if not text.isdecimal() or int(text) < 1:
-        raise ConfigError(f"environment variable WARPSLAM_THREADS = {text!r} must be a whole number from 1 on")
-    return min(cores, int(text))
+        raise ConfigError(f"environment variable {variable} = {text!r} must be a whole number from 1 on")
+    return int(text)

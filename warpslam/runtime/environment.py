@@ -12,9 +12,12 @@ from typing import TYPE_CHECKING
 
 import psutil
 
+from warpslam.errors import ConfigError, MapSizeError
+
 if TYPE_CHECKING:
     import warp as wp
 
+_TOO_SMALL_TO_ASK = 1 << 26
 PACKAGES = ("warp-lang", "torch", "numpy", "scipy", "trimesh", "opencv-python-headless", "open3d")
 
 
@@ -59,9 +62,42 @@ def resident_bytes() -> int:
     return int(psutil.Process().memory_info().rss)
 
 
+def named_device(name: str | None) -> wp.Device:
+    """The Warp device of a name; its preferred one for None.
+
+    Raises:
+        ConfigError: There is none of that name.
+    """
+    import warp as wp
+
+    known = [str(device) for device in wp.get_devices()]
+    try:
+        return wp.get_device(name)
+    except (RuntimeError, ValueError, TypeError, AttributeError) as error:
+        raise ConfigError(f"device {name!r} is not there; this machine has {', '.join(known)}") from error
+
+
 def free_gigabytes(device: wp.Device) -> float:
     """Memory of a device, or of the machine for the CPU, that is not in use [GB]."""
     return (device.free_memory if device.is_cuda else psutil.virtual_memory().available) / 1e9
+
+
+def check_memory(device: wp.Device, size: float, what: str) -> None:
+    """Whether a device has room for something, asked before it is allocated.
+
+    Args:
+        device: Where it will be.
+        size: What it takes [bytes].
+        what: Its name and what makes it smaller, for the message.
+
+    Raises:
+        MapSizeError: It has not.
+    """
+    if size < _TOO_SMALL_TO_ASK:
+        return
+    free = free_gigabytes(device)
+    if free is not None and size / 1e9 > free:
+        raise MapSizeError(f"{what}: {size / 1e9:.1f} GB are needed, and {device} has {free:.1f} GB free")
 
 
 def peak_memory_mib() -> float:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from warpslam.errors import ConfigError
 
+_MODULE_BYTES = 32_000_000
 log = logging.getLogger(__name__)
 
 
@@ -26,6 +28,25 @@ def kernel_cache_errors() -> Iterator[None]:
             f"kernel cache {kernel_cache()} can't be written ({reason}), and it does not hold all kernels yet; "
             "set WARP_CACHE_PATH to a folder that can be written to"
         ) from error
+
+
+def check_room() -> None:
+    """Whether a module that is about to be compiled fits into the cache: on a full disk the compiler ends the process.
+
+    Raises:
+        ConfigError: It does not.
+    """
+    folder = kernel_cache()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(folder).free
+    except OSError:
+        return  # said by what needs it
+    if free < _MODULE_BYTES:
+        raise ConfigError(
+            f"kernel cache {folder} has {free / 1e6:.1f} MB left, and a module of kernels takes up to "
+            f"{_MODULE_BYTES / 1e6:.0f} MB: free some space, or set WARP_CACHE_PATH to a folder that has it"
+        )
 
 
 def kernel_cache() -> Path:

@@ -3,7 +3,7 @@
 Warp runs a CPU kernel on the calling thread and releases the GIL meanwhile. Kernels over rays and their samples
 therefore run in equal slices of the rays, one a thread; those that add up gradients get a buffer (``slot``) for each
 slice, since atomics are not atomic on the CPU. The number of slices is fixed, so that sums are formed in the same
-order in every run.
+order in every run, on any number of cores.
 """
 
 from __future__ import annotations

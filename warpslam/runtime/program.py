@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, partial
@@ -10,13 +11,18 @@ from typing import Any
 
 import warp as wp
 
-from warpslam.runtime.cores import MAX_SLICES
+from warpslam.runtime.cores import MAX_SLICES, thread_count
 
 
 @lru_cache(maxsize=1)
 def _pool() -> ThreadPoolExecutor:
     # Tracking and mapping may both run slices (`mapping.scheduler`), and neither should queue behind the other.
     return ThreadPoolExecutor(max_workers=2 * (MAX_SLICES - 1), thread_name_prefix="warpslam")
+
+
+if hasattr(os, "register_at_fork"):
+    # Threads do not survive a fork: a child that waited for those of its parent would wait for ever.
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 class Program:
@@ -59,12 +65,21 @@ class Program:
 
 
 def run_slices(commands: list[list[wp.Launch]]) -> None:
-    """Each slice's launches in order, the slices side by side."""
-    first, *others = commands
-    waiting = [_pool().submit(_run_all, part) for part in others]
-    _run_all(first)
+    """Each slice's launches in order, the slices side by side on as many threads as there are cores.
+
+    Which thread runs a slice changes nothing: each has buffers of its own.
+    """
+    threads = min(len(commands), thread_count())
+    mine, *others = (commands[n::threads] for n in range(threads))
+    waiting = [_pool().submit(_run_parts, parts) for parts in others]
+    _run_parts(mine)
     for other in waiting:
         other.result()
+
+
+def _run_parts(parts: list[list[wp.Launch]]) -> None:
+    for part in parts:
+        _run_all(part)
 
 
 _LAUNCH = wp.Launch.launch

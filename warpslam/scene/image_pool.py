@@ -13,6 +13,7 @@ import warp as wp
 from warpslam.camera import NO_MOTION, FrameMotion, Intrinsics
 from warpslam.errors import MapSizeError
 from warpslam.kernels import images as image_kernels
+from warpslam.runtime.environment import check_memory
 from warpslam.scene.rectification import Rectifier
 
 _Image = tuple[np.ndarray, np.ndarray, float]
@@ -56,6 +57,8 @@ class ImagePool:
 
     def _allocate(self, capacity: int) -> None:
         shape = (capacity, self.camera.height, self.camera.width)
+        size = f"{self.camera.width} x {self.camera.height}"
+        check_memory(self.device, 5 * np.prod(shape, dtype=float), f"{capacity} images of {size}: use smaller ones")
         self.rgb = wp.zeros((*shape, 3), dtype=wp.uint8, device=self.device)
         self.depth = wp.zeros(shape, dtype=wp.uint16, device=self.device)
         self.scale = wp.zeros(capacity, dtype=float, device=self.device)

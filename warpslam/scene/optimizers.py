@@ -1,4 +1,6 @@
-"""Adam state for grid rows, the colour decoder and poses; moments are fresh in every call, as in the released code."""
+"""Adam state for grid rows, the colour decoder and poses; `start` makes moments fresh in every call, as in the released
+code.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +15,7 @@ from warpslam.kernels.decoder.layout import COLOR_WEIGHT_ROWS
 from warpslam.kernels.grid import Vec32
 from warpslam.runtime.launching import Launcher, Step
 from warpslam.scene.feature_grid import FeatureGrid
+from warpslam.scene.touched_rows import TouchedRowsState
 
 
 class RowOptimizer:
@@ -69,10 +72,12 @@ class GridOptimizer(RowOptimizer):
         """``selected``: bool (rows,), from frustum selection."""
         self.start(grid.row_count, np.flatnonzero(selected))
         self.selected = wp.array(selected.astype(np.uint8), dtype=wp.uint8, device=self.device)
+        place = np.where(selected, np.arange(grid.row_count), -1)
+        self._place = wp.array(place.astype(np.int32), dtype=int, device=self.device)
 
     def wanted(self) -> GridGradient:
         """Where the kernels put this level's gradient, and for which rows."""
-        return GridGradient(self.gradient, self.selected)
+        return GridGradient(self.gradient, self._place)
 
 
 class ColorDecoderOptimizer(RowOptimizer):
@@ -82,6 +87,18 @@ class ColorDecoderOptimizer(RowOptimizer):
         """Start a call: all rows change."""
         self._buffers = decoders_for(self.device).weight_slots
         self.start(COLOR_WEIGHT_ROWS, np.arange(COLOR_WEIGHT_ROWS))
+
+    def state(self) -> TouchedRowsState:
+        """What the next step depends on beside the weights."""
+        count = int(self.step.numpy()[0])
+        moments = np.stack([self.m.numpy(), self.v.numpy()], axis=1)
+        return TouchedRowsState(np.arange(self.size, dtype=np.int32), np.full(self.size, count, np.int32), moments)
+
+    def restore(self, state: TouchedRowsState) -> None:
+        """Put back what `state` was."""
+        self.m.assign(np.ascontiguousarray(state.moments[:, 0]))
+        self.v.assign(np.ascontiguousarray(state.moments[:, 1]))
+        self.step.assign(state.updates[:1])
 
     def update_decoder(self, packed: PackedDecoder, learning_rate: float) -> None:
         """One step on the packed weights."""

@@ -15,8 +15,10 @@ from warpslam.field.decoders import LEVELS, Decoders
 from warpslam.field.packing import PackedDecoder
 from warpslam.field.passes import query
 from warpslam.field.ray_batch import RayBatch
+from warpslam.poses import MAX_DISTANCE, as_numbers
 from warpslam.runtime.cores import slice_count
 from warpslam.runtime.environment import free_gigabytes
+from warpslam.runtime.exclusive import ObjectLock, exclusive
 from warpslam.runtime.phases import phase
 from warpslam.scene.feature_grid import FeatureGrid, GridState
 
@@ -57,6 +59,7 @@ class SceneMap:
         self.high = np.zeros(3)
         self._buffers = 1
         self._queries: RayBatch | None = None
+        self.lock = ObjectLock(outlives_fork=not device.is_cuda)
 
     def copy(self) -> SceneMap:
         """The same map in arrays of its own, which is meant to exist beside this one."""
@@ -106,9 +109,28 @@ class SceneMap:
         Raises:
             MapSizeError: The grown map would not fit `GridConfig.max_gigabytes`, or what is free.
         """
-        spacing, margin = self.config.middle_spacing, self.config.margin
         if not self.is_empty and (low > self.low).all() and (high < self.high).all():
             return False
+        low, high = self._grown(low, high)
+        self.low, self.high = low, high
+        for level, grid in self.grids.items():
+            # One more coarse cell around, so that the forecast reaches beyond what was seen.
+            extra = grid.spacing if level == "coarse" else 0.0
+            grid.cover(low - extra, high + extra)
+        _log.info("map covers %s to %s m", np.round(low, 2).tolist(), np.round(high, 2).tolist())
+        return True
+
+    def check_growth(self, low: np.ndarray, high: np.ndarray) -> None:
+        """Whether the map could hold a box [m].
+
+        Raises:
+            MapSizeError: As `cover` does.
+        """
+        self._grown(low, high)
+
+    def _grown(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The bounds of the map when it holds a box plus the margin, if it can."""
+        spacing, margin = self.config.middle_spacing, self.config.margin
         low = np.floor((low - margin) / spacing) * spacing
         high = np.ceil((high + margin) / spacing) * spacing
         if not self.is_empty:
@@ -128,13 +150,7 @@ class SceneMap:
                 f"{self.device} has {free:.1f} GB free: lower grid.max_depth (now {self.config.max_depth} m), or check "
                 "the depth scale"
             )
-        self.low, self.high = low, high
-        for level, grid in self.grids.items():
-            # One more coarse cell around, so that the forecast reaches beyond what was seen.
-            extra = grid.spacing if level == "coarse" else 0.0
-            grid.cover(low - extra, high + extra)
-        _log.info("map covers %s to %s m", np.round(low, 2).tolist(), np.round(high, 2).tolist())
-        return True
+        return low, high
 
     def gigabytes(self, low: np.ndarray, high: np.ndarray) -> float:
         """Memory of the grids over a box, with both Adam moments and the gradient buffers [GB]."""
@@ -167,10 +183,14 @@ class SceneMap:
         """Colours in [0, 1], float32 (N, 3), at world points (N, 3) [m]."""
         return self._query(points, "color")
 
+    @exclusive
     def _query(self, points: np.ndarray, stage: str) -> np.ndarray:
-        points = np.asarray(points, np.float32)
+        points = as_numbers(points, "points")
         if points.ndim != 2 or points.shape[1] != 3:
             raise InputError(f"points have shape {points.shape}, expected (N, 3)")
+        if not (np.abs(points) <= MAX_DISTANCE).all():  # NaN is not
+            raise InputError(f"points must be finite and within {MAX_DISTANCE:g} m of the origin")
+        points = points.astype(np.float32)
         if self.is_empty:
             raise InputError("the map is empty: step at least one frame first")
         if self._queries is None:

@@ -6,7 +6,7 @@ import importlib
 import os
 from pathlib import Path
 
-from warpslam.errors import DatasetError
+from warpslam.errors import DatasetError, brief
 from warpslam.sequences.base import Frame, RgbdSequence
 
 __all__ = ["DATASETS", "Frame", "RgbdSequence", "guess_dataset", "open_sequence"]
@@ -56,6 +56,13 @@ def guess_dataset(path: str | os.PathLike[str]) -> str:
         DatasetError: If the folder is missing or no known layout fits; the message lists what was looked for.
     """
     path = _existing_folder(path)
+    try:
+        return _guess(path)
+    except OSError as error:
+        raise DatasetError(f"{error.filename or path}: can't be read ({error.strerror or error})") from error
+
+
+def _guess(path: Path) -> str:
     found = _match(path)
     if found is not None:
         return found
@@ -87,6 +94,15 @@ def open_sequence(path: str | os.PathLike[str], dataset: str = "auto", camera: s
         DatasetError: If the folder, a file in it or the camera can't be used.
         MissingDependencyError: If the format needs an optional package that is not installed.
     """
+    try:
+        return _open(path, dataset, camera)
+    except OSError as error:
+        raise DatasetError(f"{error.filename or path}: can't be read ({error.strerror or error})") from error
+    except MemoryError:
+        raise DatasetError(f"{path}: its lists do not fit into memory; are they of this sequence?") from None
+
+
+def _open(path: str | os.PathLike[str], dataset: str, camera: str | None) -> RgbdSequence:
     path = _existing_folder(path)
     name = dataset.strip().lower().replace("-", "_")
     name = _ALIASES.get(name, name)
@@ -106,8 +122,12 @@ def _match(path: Path) -> str | None:
 
 
 def _existing_folder(path: str | os.PathLike[str]) -> Path:
-    path = Path(path).expanduser()
-    if not path.exists():
+    try:
+        path = Path(path).expanduser()
+        exists = path.exists()
+    except (OSError, ValueError, RuntimeError) as error:  # a name too long, a zero in it, a user without a home
+        raise DatasetError(f"{brief(path)}: can't be a folder ({error})") from error
+    if not exists:
         raise DatasetError(f"{path}: no such folder; check the path of the sequence")
     if not path.is_dir():
         raise DatasetError(f"{path} is a file; pass the folder that holds the sequence")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from warpslam.errors import DatasetError
+from warpslam.errors import DatasetError, brief
+from warpslam.reading import YAML_LIMIT, read_text
 from warpslam.sequences.calibration import Calibration, find_calibration, has_own_camera
 from warpslam.sequences.files import FileSequence
 from warpslam.sequences.image_files import list_images
@@ -43,12 +44,12 @@ class AzureSequence(FileSequence):
 def _from_intrinsic_json(path: Path) -> Calibration:
     """Camera of a file by Open3D: width, height and the column-major 3x3 intrinsic_matrix."""
     try:
-        fields = json.loads(path.read_text(encoding="utf-8"))
+        fields = json.loads(read_text(path, YAML_LIMIT))
         fx, _, _, _, fy, _, cx, cy, _ = fields["intrinsic_matrix"]
         size = {"width": fields["width"], "height": fields["height"]}
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise DatasetError(
-            f"{path}: no camera of Open3D (width, height, intrinsic_matrix with 9 numbers): {error!r}; "
+            f"{path}: no camera of Open3D (width, height, intrinsic_matrix with 9 numbers): {brief(repr(error))}; "
             "correct it or write a camera.yaml"
         ) from error
     return Calibration.from_fields({"fx": fx, "fy": fy, "cx": cx, "cy": cy, **size, "depth_scale": 1000}, str(path))

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from warpslam.camera import ONE_MOMENT, Intrinsics, SensorTiming
-from warpslam.errors import ConfigError, DatasetError
+from warpslam.errors import ConfigError, DatasetError, brief
+from warpslam.reading import YAML_LIMIT, load_yaml, read_bytes
 
 CAMERA_FIELDS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale")
 CAMERA_FILE = "camera.yaml"
@@ -95,7 +96,7 @@ class Calibration:
         unknown = sorted(set(map(str, fields)) - set(CAMERA_FIELDS) - set(_OPTIONAL_FIELDS))
         if unknown:
             known = ", ".join(CAMERA_FIELDS + _OPTIONAL_FIELDS)
-            raise DatasetError(f"{source}: unknown field {', '.join(unknown)}; known fields are {known}")
+            raise DatasetError(f"{source}: unknown field {brief(', '.join(unknown))}; known fields are {known}")
         missing = [name for name in CAMERA_FIELDS if name not in fields]
         if missing:
             raise DatasetError(f"{source}: field {', '.join(missing)} is missing; add it")
@@ -122,7 +123,7 @@ class Calibration:
             raise DatasetError(f"{source}: crop = {crop} must be 0 or more pixels")
         depth_distorted = fields.get("depth_distorted", False)
         if not isinstance(depth_distorted, bool):
-            raise DatasetError(f"{source}: depth_distorted = {depth_distorted!r} must be true or false")
+            raise DatasetError(f"{source}: depth_distorted = {brief(repr(depth_distorted))} must be true or false")
         published_crop = fields.get("published_crop")
         if published_crop is not None:
             published_crop = _whole(_number(published_crop, "published_crop", source), "published_crop", source)
@@ -151,7 +152,7 @@ class Calibration:
     def from_yaml(cls, path: Path) -> Calibration:
         """Read a ``camera.yaml``."""
         try:
-            text = path.read_bytes()
+            text = read_bytes(path, YAML_LIMIT)
         except OSError as error:
             raise DatasetError(f"{path}: can't be read ({error.strerror}); correct or remove the file") from error
         return cls.from_fields(_load_yaml(text, str(path)), str(path))
@@ -162,9 +163,10 @@ class Calibration:
         parts = [part.strip() for part in text.replace(";", ",").split(",")]
         if len(parts) != len(CAMERA_FIELDS):
             raise DatasetError(
-                f"camera = {text!r} has {len(parts)} numbers; give {len(CAMERA_FIELDS)}: {','.join(CAMERA_FIELDS)}"
+                f"camera = {brief(repr(text))} has {len(parts)} numbers; give {len(CAMERA_FIELDS)}: "
+                f"{','.join(CAMERA_FIELDS)}"
             )
-        return cls.from_fields(dict(zip(CAMERA_FIELDS, parts, strict=True)), f"camera = {text!r}")
+        return cls.from_fields(dict(zip(CAMERA_FIELDS, parts, strict=True)), f"camera = {brief(repr(text))}")
 
     @classmethod
     def of_dataset(cls, name: str) -> Calibration:
@@ -198,14 +200,10 @@ def has_own_camera(folder: Path) -> bool:
 
 
 def _load_yaml(text: bytes, source: str) -> dict[str, Any]:
-    import yaml
-
     try:
-        fields = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # it lets those of numbers and dates through
-        raise DatasetError(
-            f"{source}: not valid YAML ({' '.join(str(error).split())}); write one 'name: number' a line"
-        ) from error
+        fields = load_yaml(text)
+    except ValueError as error:
+        raise DatasetError(f"{source}: not valid YAML ({brief(error)}); write one 'name: number' a line") from error
     if not isinstance(fields, dict):
         raise DatasetError(f"{source}: holds no fields; write one 'name: number' a line for {', '.join(CAMERA_FIELDS)}")
     return fields
@@ -218,13 +216,13 @@ def _number(value: Any, name: str, source: str) -> float:
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
-        raise DatasetError(f"{source}: {name} = {value!r} must be a finite number")
+        raise DatasetError(f"{source}: {name} = {brief(repr(value))} must be a finite number")
     return number
 
 
 def _numbers(value: Any, name: str, source: str) -> tuple[float, ...]:
     if not isinstance(value, (list, tuple)):
-        raise DatasetError(f"{source}: {name} = {value!r} must be a list of numbers")
+        raise DatasetError(f"{source}: {name} = {brief(repr(value))} must be a list of numbers")
     return tuple(_number(item, name, source) for item in value)
 
 
@@ -241,5 +239,7 @@ def _size(fields: dict[str, Any], name: str, source: str) -> tuple[int, int] | N
         return None
     pair = _numbers(size, name, source)
     if len(pair) != 2 or min(pair) < 1 or max(pair) > _MAX_SIZE:
-        raise DatasetError(f"{source}: {name} = {size!r} must be [width, height] in pixels, 1 to {_MAX_SIZE} each")
+        raise DatasetError(
+            f"{source}: {name} = {brief(repr(size))} must be [width, height] in pixels, 1 to {_MAX_SIZE} each"
+        )
     return _whole(pair[0], name, source), _whole(pair[1], name, source)

@@ -29,6 +29,6 @@ class CoFusionSequence(FileSequence):
 
     def read_depth_metres(self, path: Path) -> np.ndarray:
         """Stored depth image in metres, float32, shape (H, W), 0 = missing."""
-        depth = read_exr(path) / np.float32(self.calibration.depth_scale)
+        depth = read_exr(path, check=self._check_depth_size) / np.float32(self.calibration.depth_scale)
         with np.errstate(invalid="ignore"):
             return np.where((depth > 0) & (depth < _MAX_DEPTH), depth, np.float32(0))

@@ -6,7 +6,7 @@ import copy
 import operator
 import re
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -111,7 +111,7 @@ class FileSequence(RgbdSequence):
 
     def read_depth_metres(self, path: Path) -> np.ndarray:
         """Stored depth image in metres, float32, shape (H, W), 0 = missing."""
-        return read_depth(path).astype(np.float32) / np.float32(self.calibration.depth_scale)
+        return read_depth(path, self._check_depth_size).astype(np.float32) / np.float32(self.calibration.depth_scale)
 
     def _check_first_frames(self) -> None:
         """A camera that does not fit the images is found now rather than after a run has begun; but a single bad frame
@@ -128,13 +128,23 @@ class FileSequence(RgbdSequence):
             raise first_error
 
     def _load(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        rgb, depth = read_rgb(self._rgb_files[index]), self.read_depth_metres(self._depth_files[index])
-        self._check_size(self._depth_files[index], "depth", depth)
+        try:
+            return self._read(index)
+        except OSError as error:
+            raise DatasetError(f"{error.filename}: can't be read ({error.strerror or error})") from error
+        except MemoryError:
+            raise DatasetError(f"frame {index} of {self.name} does not fit into memory; close other programs") from None
+
+    def _read(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        check = None if self._color_size_may_differ else partial(self._check_size, "colour")
+        depth = self.read_depth_metres(self._depth_files[index])
+        self._check_depth_size(self._depth_files[index], depth.shape[1], depth.shape[0])
+        rgb = read_rgb(self._rgb_files[index], check)
         if self._color_size_may_differ and rgb.shape[:2] != depth.shape:
             import cv2
 
             rgb = cv2.resize(rgb, (depth.shape[1], depth.shape[0]), interpolation=cv2.INTER_LINEAR)
-        self._check_size(self._rgb_files[index], "colour", rgb)
+        self._check_size("colour", self._rgb_files[index], rgb.shape[1], rgb.shape[0])
         if self.calibration.distortion:
             import cv2
 
@@ -157,8 +167,10 @@ class FileSequence(RgbdSequence):
         size = (camera.width, camera.height)
         return cv2.initUndistortRectifyMap(camera.matrix, coefficients, None, camera.matrix, size, cv2.CV_32FC1)
 
-    def _check_size(self, path: Path, kind: str, image: np.ndarray) -> None:
-        height, width = image.shape[:2]
+    def _check_depth_size(self, path: Path, width: int, height: int) -> None:
+        self._check_size("depth", path, width, height)
+
+    def _check_size(self, kind: str, path: Path, width: int, height: int) -> None:
         camera = self.calibration.stored
         if (width, height) != (camera.width, camera.height):
             raise DatasetError(

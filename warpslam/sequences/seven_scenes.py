@@ -35,7 +35,7 @@ class SevenScenesSequence(FileSequence):
 
     def read_depth_metres(self, path: Path) -> np.ndarray:
         """Stored depth image in metres, float32, shape (H, W), 0 = missing."""
-        stored = read_depth(path)
+        stored = read_depth(path, self._check_depth_size)
         stored[stored == _INVALID_DEPTH] = 0
         return stored.astype(np.float32) / np.float32(self.calibration.depth_scale)
 

@@ -7,8 +7,11 @@ import math
 from pathlib import Path
 from typing import Any
 
-from warpslam.errors import DatasetError
+from warpslam.errors import DatasetError, brief
+from warpslam.reading import MEGABYTE, read_text
 from warpslam.storage.atomic import replacing
+
+_LIMIT = 1024 * MEGABYTE  # that of a run of a million frames
 
 
 def write_json(path: Path, value: Any) -> None:
@@ -29,9 +32,9 @@ def read_json(path: Path) -> dict[str, Any]:
         DatasetError: The file can't be read or holds something else.
     """
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DatasetError(f"{path}: can't be read as JSON ({error}); run again to write it anew") from error
+        value = json.loads(read_text(path, _LIMIT))
+    except (OSError, ValueError, RecursionError) as error:
+        raise DatasetError(f"{path}: can't be read as JSON ({brief(error)}); run again to write it anew") from error
     if not isinstance(value, dict):
         raise DatasetError(f"{path}: expected a JSON object, found {type(value).__name__}")
     return value

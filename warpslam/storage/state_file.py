@@ -21,6 +21,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from warpslam.errors import CheckpointError, ConfigError
+from warpslam.poses import are_rigid
+from warpslam.reading import check_regular
 from warpslam.storage.atomic import replacing
 
 T = TypeVar("T")
@@ -80,6 +82,7 @@ def read_state(path: Path, form: StateFormat) -> tuple[dict[str, Any], dict[str,
         CheckpointError: The file is missing, truncated, altered, of another kind, or of another version.
     """
     try:
+        check_regular(path)
         with open(path, "rb") as opened:
             if opened.read(2) == b"PK":
                 raise CheckpointError(
@@ -98,7 +101,9 @@ def read_state(path: Path, form: StateFormat) -> tuple[dict[str, Any], dict[str,
         raise CheckpointError(f"{path}: no such file") from None
     except OSError as error:
         raise CheckpointError(f"{path}: can't be read ({error.strerror or error})") from error
-    except (SafetensorError, TypeError, ValueError) as error:
+    except MemoryError:
+        raise CheckpointError(f"{path}: does not fit into memory; close other programs") from None
+    except (SafetensorError, TypeError, ValueError, OverflowError, AttributeError) as error:
         where = _damaged_entry(path)
         what = f"field {where} is damaged" if where else "no state file of warpslam, or its table is damaged"
         raise CheckpointError(f"{path}: {what}, truncated or altered ({error}): use another copy") from None
@@ -197,6 +202,13 @@ class StateFields:
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise self.damaged(name, "it holds NaN or infinity")
         return array
+
+    def poses(self, name: str, count: int | None) -> np.ndarray:
+        """Rigid transforms of a camera, float64 (``count``, 4, 4), none too far from the origin."""
+        poses = self.array(name, np.float64, (count, 4, 4))
+        if not are_rigid(poses):
+            raise self.damaged(name, "they are no rigid transforms of a camera, or too far from the origin")
+        return poses
 
     def parsed(self, name: str, parse: Callable[[dict[str, Any]], T]) -> T:
         """What ``parse`` makes of a mapping."""

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warpslam.errors import DatasetError
+from warpslam.errors import DatasetError, brief
+from warpslam.reading import read_text
 
 
 def read_lines(path: Path) -> list[tuple[int, list[str]]]:
@@ -16,9 +17,13 @@ def read_lines(path: Path) -> list[tuple[int, list[str]]]:
         DatasetError: The file can't be read as text.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{path}: can't be read as text ({error}); fetch the file again") from error
+        text = read_text(path, encoding="utf-8-sig")
+    except OSError as error:
+        raise DatasetError(
+            f"{path}: can't be read as text ({error.strerror or error}); fetch the file again"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{path}: can't be read as text ({error.reason}); fetch the file again") from error
     lines = ((number, line.replace(",", " ").split()) for number, line in enumerate(text.splitlines(), start=1))
     return [(number, words) for number, words in lines if words and not words[0].startswith("#")]
 
@@ -48,4 +53,4 @@ def parse_numbers(path: Path, number: int, words: list[str], count: int, meaning
     try:
         return np.array([float(word) for word in words])
     except ValueError as error:
-        raise DatasetError(f"{path}:{number}: {error} (expected {meaning}); correct the line") from error
+        raise DatasetError(f"{path}:{number}: {brief(error)} (expected {meaning}); correct the line") from error

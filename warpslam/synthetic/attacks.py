@@ -223,6 +223,29 @@ def half_depth(sequence: RgbdSequence, *, seed: int = 0, share: float = 0.5) -> 
     return AlteredSequence(sequence, "half", change=change)
 
 
+def carry_lamp(
+    sequence: RgbdSequence, *, share: float = 0.5, reach: float = 1.0, spot: float = 25.0
+) -> AlteredSequence:
+    """``share`` of the light comes from a lamp on the camera: shading goes along with the camera, not with the surface.
+
+    It falls off with the distance as 1 / (1 + (d / ``reach``)^2) [m], and from the middle as a bell of ``spot``
+    degrees; where depth is missing as at 5 m. The brightest place is as bright as before.
+    """
+    k = sequence.intrinsics
+    v, u = np.mgrid[: k.height, : k.width]
+    x, y = (u - k.cx) / k.fx, (v - k.cy) / k.fy
+    ray = np.sqrt(1.0 + x**2 + y**2)
+    bell = np.exp(-0.5 * (np.degrees(np.arccos(1.0 / ray)) / spot) ** 2)
+
+    def change(index: int, rgb: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        distance = np.where(depth > 0, depth, 5.0) * ray
+        light = bell / (1.0 + (distance / reach) ** 2)
+        light = (1.0 - share) + share * light / light.max()
+        return _to_bytes(rgb * light[..., None]), depth
+
+    return AlteredSequence(sequence, "lamp", change=change)
+
+
 ALTERATIONS: dict[str, Callable[[RgbdSequence], AlteredSequence]] = {
     "kinect": kinect_noise,
     "half": half_depth,
@@ -233,6 +256,7 @@ ALTERATIONS: dict[str, Callable[[RgbdSequence], AlteredSequence]] = {
     "frozen": freeze,
     "dropped": drop_frames,
     "black": black_out,
+    "lamp": carry_lamp,
 }
 """What can be done to a sequence, by name, with its defaults."""
 

@@ -12,6 +12,7 @@ from PIL import Image
 from warpslam.camera import Intrinsics
 from warpslam.errors import ConfigError, MeshError
 from warpslam.poses import check_transform
+from warpslam.runtime.environment import named_device
 
 if TYPE_CHECKING:
     import trimesh
@@ -141,7 +142,7 @@ class MeshRenderer:
 
         self.intrinsics = intrinsics
         self.max_depth = max_depth
-        self._device = wp.get_device(device)
+        self._device = named_device(device)
         with wp.ScopedDevice(self._device):
             faces = wp.array(triangles.faces.ravel(), dtype=wp.int32)
             self._mesh = wp.Mesh(wp.array(triangles.vertices, dtype=wp.vec3), faces)

@@ -197,6 +197,36 @@ def test_motion_is_taken_from_an_earlier_frame(bench):
     np.testing.assert_allclose(told["to_depth"], motion_of(0.02 * expected), atol=1e-5)
 
 
+def joined(bench, start: np.ndarray, others: np.ndarray | None, count: int) -> np.ndarray:
+    """Joint registration of row 1 to keyframe 1 from a pose on, which rows from elsewhere join."""
+    asked = task(start)
+    asked["top"], asked["iterations"] = 0, -1
+    joint = records(registration.Joint)
+    joint["row"], joint["count"], joint["keyframes"][0, 0] = 1, 1, 1
+    joint["iterations"], joint["grey"], joint["depth"], joint["others"] = 10, 2.0, 1.0, count
+    if others is not None:
+        bench.registrar.put_rows(others, 0)
+    return bench.registrar.join(bench.registrar.start(asked), joint, np.eye(4)[None]).numpy()[0].copy()
+
+
+def test_rows_from_elsewhere_join(pair_of_frames):
+    """Rows far stronger than the images pull the pose to their own minimum, wherever they are linearised, and count in
+    H; rows of nothing leave every byte.
+    """
+    alone = joined(pair_of_frames, inverse(NEXT), None, 0)
+    rows = records(registration.OtherRows)
+    rows["T"] = motion_of(np.array([0.01, 0, 0, 0, 0, 0])) @ inverse(NEXT)
+    assert joined(pair_of_frames, inverse(NEXT), rows, 1).tobytes() == alone.tobytes()
+    xi = np.array([-0.015, 0.01, -0.01, 0.005, -0.005, 0.003])
+    rows["H"] = np.diag([1e11] * 3 + [1e11] * 3)
+    rows["g"] = -1e11 * xi
+    found = joined(pair_of_frames, inverse(NEXT), rows, 1)
+    step, turn = motion_between(motion_of(xi) @ np.float64(rows["T"][0]), np.float64(found["T"]))
+    assert step < 3e-4 and turn < 0.02
+    assert motion_between(np.float64(alone["T"]), np.float64(found["T"]))[0] > 5e-3
+    np.testing.assert_allclose(np.diag(found["H"]), 1e11, rtol=0.01)
+
+
 def test_overlap_is_the_share_that_is_seen_where_it_is(pair_of_frames):
     """All of itself, nearly all after a small step, and nothing from behind."""
     behind = motion_of(np.array([0, 0, 0, 0, np.pi - 0.01, 0]))

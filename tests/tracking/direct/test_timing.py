@@ -102,7 +102,7 @@ def test_it_is_off_where_timing_is_known_or_not_wanted(late):
         new_slam("direct.timing=given"),
         new_slam("sensor_timing=false"),
         new_slam(believed=SensorTiming(-0.02, 0.026)),
-        Slam(CAMERA, Config.from_preset("paper_tum_rgbd"), "cpu"),
+        Slam(CAMERA, Config.from_preset("paper_replica"), "cpu"),
     ):
         assert slam.timing_estimator is None
     slam, plain = new_slam(), new_slam("direct.timing=given")

@@ -23,7 +23,7 @@ def poses(count: int) -> list[np.ndarray]:
     return [motion_of(n * STEP) for n in range(count)]
 
 
-def tracker(**direct: float) -> Slam:
+def tracker(**direct: float | str) -> Slam:
     """Tracks, and maps nothing."""
     return Slam(CAMERA, Config.from_dict({"mapping": {"enabled": False}, "direct": direct}), "cpu")
 

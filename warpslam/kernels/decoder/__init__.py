@@ -19,7 +19,7 @@ are full although few samples of a ray count. Forward keeps one bit per ReLU (5 
 kernels are written by hand, because the generated adjoint replays the forward and costs 4 to 16 times as much. They
 return
 
-    d_logit -> rows of the grid that are selected (`RowGradient`), the sample position (``point_grad``), and for the
+    d_logit -> rows of the grid that have a place (`RowGradient`), the sample position (``point_grad``), and for the
     colour decoder the weights including B (`WeightGradient`).
 
 As in the released code the middle feature that enters the fine decoder carries no gradient.

@@ -281,7 +281,7 @@ def sample_functions(build: Build) -> None:
                 if wp.static(on_cpu):
                     x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
                     cell = find_cell(level.lattice, x)
-                    interpolate_adjoint_features(gradient.rows, slot, gradient.selected, level.lattice, cell, dc[p])
+                    interpolate_adjoint_features(gradient.rows, slot, gradient.place, level.lattice, cell, dc[p])
                 else:
                     put_row(gradient.by_sample, samples[p], 0, dc[p])
 

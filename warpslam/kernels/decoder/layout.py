@@ -82,14 +82,14 @@ class RowGradient:
     """Gradient of a grid.
 
     wanted: Whether it is.
-    selected: Which rows get one.
-    rows: The buffers (slices, rows) it goes to.
+    place: Where in the buffers that of a row goes; -1: the row gets none.
+    rows: The buffers (slices, places) it goes to.
     by_sample: Gradient of the feature of each sample (samples, 1), which `scatter_features` brings there (CUDA).
     entries, entries_by_sample: The same memory as of both, one number an element (CUDA).
     """
 
     wanted: int
-    selected: wp.array[wp.uint8]
+    place: wp.array[int]
     rows: wp.array2d[Vec32]
     by_sample: wp.array2d[Vec32]
     entries: wp.array3d[float]

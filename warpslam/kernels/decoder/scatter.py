@@ -26,9 +26,9 @@ def scatter_kernels(build: Build) -> dict[str, wp.Kernel]:
             for dj in range(2):
                 for dk in range(2):
                     if total[4 * di + 2 * dj + dk] != 0.0:
-                        row = row_of(lattice, corner[0] + di, corner[1] + dj, corner[2] + dk)
-                        if grid.selected[row] != wp.uint8(0):
-                            wp.atomic_add(grid.entries, 0, row, channel, total[4 * di + 2 * dj + dk])
+                        n = grid.place[row_of(lattice, corner[0] + di, corner[1] + dj, corner[2] + dk)]
+                        if n >= 0:
+                            wp.atomic_add(grid.entries, 0, n, channel, total[4 * di + 2 * dj + dk])
 
     @build.kernel
     def scatter_features(listed: Listed, rays: Rays, lattice: Lattice, grid: RowGradient):

@@ -245,7 +245,7 @@ def evaluate(
                     g += (w * r) * J
                     counts[_DEPTH_COUNT] += 1.0
                     counts[_COST] += weights.depth * student_cost(ratio)
-                    wp.atomic_add(bins, _BINS + wp.min(int(wp.abs(r) / _DEPTH_BIN), _BINS - 1), 1)
+                    wp.atomic_add(bins, _BINS + wp.clamp(int(wp.abs(r) / _DEPTH_BIN), 0, _BINS - 1), 1)
         if weights.grey > 0.0 and not hidden:
             shade = bilinear(images, row, level, u, v)
             key = points.grey[keyframe, k]
@@ -266,7 +266,7 @@ def evaluate(
             counts[10] += shade[0] * shade[0]
             counts[11] += key * key
             counts[12] += shade[0] * key
-            wp.atomic_add(bins, wp.min(int(wp.abs(r) / _GREY_BIN), _BINS - 1), 1)
+            wp.atomic_add(bins, wp.clamp(int(wp.abs(r) / _GREY_BIN), 0, _BINS - 1), 1)
     group_wait()
     sums = Sums()
     sums.H = whole(group_sum_triangle(H))

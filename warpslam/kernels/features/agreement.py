@@ -34,7 +34,8 @@ def compare_pixel(
         return 0
     column = wp.rint(focal[0] * x[0] / x[2] + center[0])
     line = wp.rint(focal[1] * x[1] / x[2] + center[1])
-    if column < 0.0 or line < 0.0 or column >= float(b.shape[1]) or line >= float(b.shape[0]):
+    # So that NaN is outside.
+    if not (column >= 0.0 and line >= 0.0 and column < float(b.shape[1]) and line < float(b.shape[0])):
         return 0
     other = b[int(line), int(column)]
     if other <= NEAREST:

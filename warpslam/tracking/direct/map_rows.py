@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warpslam.field.arrays import FieldArrays, Gradients
-from warpslam.field.passes import geometry_adjoint, query_logits, steep_list
+from warpslam.field.arrays import EXACT, FieldArrays, Gradients
+from warpslam.field.passes import begin_rays, geometry_adjoint, logits, steep_list
 from warpslam.field.ray_batch import RayBatch
 from warpslam.kernels.direct import map_rows
 from warpslam.runtime.launching import Step
@@ -58,7 +58,7 @@ class MapRows:
         launcher.launch(map_rows.place_points, self.count, inputs)
 
         def steps(first: int, stop: int, slot: int) -> list[Step]:
-            result = query_logits(batch, arrays, "fine", first, stop, slot)
+            result = [begin_rays(batch, first, stop, slot), *logits(batch, arrays, "fine", first, stop, 0, 1, EXACT)]
             result.append((map_rows.list_all, stop - first, [steep_list(batch, first, slot), stop - first]))
             for level in ("middle", "fine"):
                 result += geometry_adjoint(batch, arrays, level, POINTS, first, stop, slot)

@@ -17,6 +17,8 @@ FIRST_KEYFRAMES = 16
 """Rows of points to begin with; they double as keyframes come."""
 MOST_NEAR = 24
 """Keyframes whose overlap with a frame is asked for at once."""
+MOST_OTHERS = 2
+"""Rows from elsewhere that join: the map's and those of features."""
 ALIGNED = 64
 """Bytes that a part of a buffer begins at a multiple of."""
 OVERLAP_STRIDE = 2
@@ -84,6 +86,7 @@ class Registrar:
         self._buffers: dict[str, wp.array] = {}
         self._mean_depths: dict[int, float] = {}  # by row
         last = plan.levels[-1]
+        self._others = wp.zeros(MOST_OTHERS, dtype=registration.OtherRows, device=device)
         self._report = _Report(int(last["width"] * last["height"]), device)
 
     # -- images and points ---------------------------------------------------------------------------------------
@@ -171,15 +174,11 @@ class Registrar:
         start: wp.array,
         joint: np.ndarray,
         to_reference: np.ndarray,
-        others: wp.array | None = None,
         result: wp.array | None = None,
     ) -> wp.array:
         """A `registration.Joint` from the pose of ``start`` on, without waiting; its `registration.Result` (1,).
-
-        others: `registration.OtherRows` that join.
+        Rows that join are those of `put_rows`.
         """
-        if others is None:
-            others = self._array("others", registration.OtherRows, 1)
         joints = self._upload("joints", registration.Joint, joint)
         matrices = self._upload("to_reference", wp.mat44, to_reference.astype(np.float32))
         if result is None:
@@ -192,7 +191,7 @@ class Registrar:
             self._motions,
             joints,
             matrices,
-            others,
+            self._others,
             start,
             self.lanes,
             self._histograms(1),
@@ -209,8 +208,7 @@ class Registrar:
         near: Sequence[int],
         near_to_reference: np.ndarray,
         back: np.ndarray,
-        others: np.ndarray | None = None,
-        more: Callable[[wp.array, wp.array, int], None] | None = None,
+        more: Callable[[wp.array, wp.array], None] | None = None,
     ) -> FollowedRecords:
         """Register to the reference, from there to several keyframes at once, see which others overlap, and look back;
         all of it is read at once.
@@ -223,25 +221,19 @@ class Registrar:
             near_to_reference: The same for these, (near, 4, 4).
             back: A `registration.Pair`, from the frame's points, which are chosen here, to the reference; its pose is
                 filled in: the inverse of the joint one.
-            others: `registration.OtherRows` that join.
-            more: Writes one more into the array that is its second argument, at the place that is its third, for the
-                pose of the `registration.Result` that is its first; the frame's points are chosen for it.
+            more: Writes `registration.OtherRows` that join, for the pose of the `registration.Result` that is its first
+                argument, into the first place of the second; the frame's points are chosen for it.
         """
         row = int(joint["row"][0])
         report = self._report
         scratch = int(back["keyframe"][0])
         started = self.start(task, report.started)
-        if others is None:
-            others = records(registration.OtherRows, 0)
-        rows = self._array("others", registration.OtherRows, len(others) + 1)
-        if len(others):
-            rows[: len(others)].assign(others)
-        joint["others"] = len(others)
+        joint["others"] = 0
         if more is not None:
             self.select(row, scratch)
-            more(started, rows, len(others))
-            joint["others"] += 1
-        joined = self.join(started, joint, joint_to_reference, rows, report.joined)
+            more(started, self._others)
+            joint["others"] = 1
+        joined = self.join(started, joint, joint_to_reference, report.joined)
         self.overlaps(row, joined, near, near_to_reference, report.shares)
         pairs = self._upload("back", registration.Pair, back)
         self._launcher.launch(registration.look_back, 1, [joined, pairs])
@@ -297,6 +289,15 @@ class Registrar:
         identity["T"] = np.eye(4)
         still = self._upload("identity", registration.Result, identity)
         return np.array(self.overlaps(row, still, keyframes, T_frame_keyframe).numpy()[: len(keyframes)])
+
+    def put_rows(self, rows: np.ndarray, first: int) -> None:
+        """Where `registration.OtherRows` lie that join a joint registration: ``Joint.others`` says how many."""
+        self._others[first : first + len(rows)].assign(rows)
+
+    def join_again(self, joint: np.ndarray, to_reference: np.ndarray) -> np.ndarray:
+        """The joint registration of the last `follow` with other rows: its `registration.Result`."""
+        result = self.join(self._report.started, joint, to_reference, self._report.joined)
+        return np.array(result.numpy()[0])
 
     def sum_map_rows(self, inputs: list[Any], rows: wp.array, at: int) -> None:
         """Launch `map_rows.sum_map_rows`, without waiting."""

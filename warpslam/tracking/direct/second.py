@@ -6,18 +6,21 @@ Features of a frame are computed when somebody asks for them, from the images th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import warp as wp
 
-from warpslam.camera import Intrinsics
+from warpslam.camera import NO_MOTION, FrameMotion, Intrinsics
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
-from warpslam.tracking.features.detection import FeatureFrame, detect
+from warpslam.tracking.features.detection import FeatureFrame, SensorTiming, detect, retimed
 from warpslam.tracking.features.settings import FeatureSettings
-from warpslam.tracking.features.witness import FeatureWitness, Witness
+from warpslam.tracking.features.witness import FeatureRows, FeatureWitness, Witness
+
+LATEST = 2
+"""Frames whose features are kept."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,10 @@ class Picture:
     """uint8 (H, W, 3)."""
     depth: np.ndarray
     """float32 (H, W) [m]."""
+    index: int = -1
+    """Of the frame: its features are found once; -1 = it has none."""
+    motion: FrameMotion = NO_MOTION
+    """Of the camera while it took the frame, by which features are brought to one time."""
 
     @classmethod
     def of(cls, rgb: np.ndarray, units: np.ndarray, scale: float) -> Picture:
@@ -57,7 +64,8 @@ class SecondWitness:
         self.camera, self.keyframes, self.images = camera, keyframes, images
         self.settings = FeatureSettings(max_depth=max_depth)
         self._witness = FeatureWitness(camera, device, self.settings)
-        self._known: set[int] = set()
+        self._known: dict[int, FrameMotion] = {}  # the motion that a keyframe's features were corrected by
+        self._latest: dict[int, FeatureFrame] = {}  # of frames as they were found, by index
 
     @property
     def depth_sigma(self) -> float:
@@ -88,15 +96,31 @@ class SecondWitness:
         self._learn(keyframes)
         return self._witness.relocalize(self._features(frame), self._poses(keyframes), keyframes)
 
+    def rows(self, frame: Picture, pose: np.ndarray, keyframes: Sequence[int]) -> FeatureRows | None:
+        """Matches of a frame whose pose is nearly known with keyframes; see `FeatureWitness.rows`."""
+        self._learn(keyframes)
+        return self._witness.rows(self._features(frame), self._poses(keyframes), keyframes, pose)
+
     def _poses(self, keyframes: Sequence[int]) -> dict[int, np.ndarray]:
         return {number: self.keyframes[number].pose for number in keyframes}
 
     def _features(self, picture: Picture) -> FeatureFrame:
-        return detect(picture.grey, picture.depth, self.camera, self.settings)
+        found = self._latest.get(picture.index)
+        if found is None:
+            found = detect(picture.grey, picture.depth, self.camera, self.settings)
+        if picture.index >= 0:
+            self._latest[picture.index] = found
+            while len(self._latest) > LATEST:
+                del self._latest[min(self._latest)]
+        if picture.motion.is_none:
+            return found
+        timing = SensorTiming(picture.motion.depth_offset, picture.motion.readout)
+        return retimed(found, picture.depth, self.camera, self.settings, timing, np.array(picture.motion.twist))
 
     def _learn(self, keyframes: Sequence[int]) -> None:
         for number in keyframes:
-            if number not in self._known:
-                picture = Picture.of(*self.images.kept(self.keyframes[number].image).unpack(self.camera))
-                self._witness.add_keyframe(number, self._features(picture))
-                self._known.add(number)
+            keyframe = self.keyframes[number]
+            if self._known.get(number) != keyframe.motion:
+                picture = Picture.of(*self.images.kept(keyframe.image).unpack(self.camera))
+                self._witness.add_keyframe(number, self._features(replace(picture, motion=keyframe.motion)))
+                self._known[number] = keyframe.motion

@@ -27,6 +27,7 @@ from warpslam.poses import inverse, motion_between, motion_of, orthonormalized, 
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
 from warpslam.tracking.direct.aliases import difference_elsewhere
+from warpslam.tracking.direct.joint_rows import LINEARIZATIONS, WEAK_SIGMA, feature_rows, is_far, weakest_sigma
 from warpslam.tracking.direct.map_rows import MapRows
 from warpslam.tracking.direct.measures import Measures
 from warpslam.tracking.direct.pyramid import PyramidPlan, records
@@ -186,7 +187,8 @@ class _Before:
     @property
     def picture(self) -> Picture:
         """The frame as it comes back from a file."""
-        return Picture(self.rgb, self.depth) if self.kept is None else Picture.of(*self.kept)
+        found = Picture(self.rgb, self.depth) if self.kept is None else Picture.of(*self.kept)
+        return replace(found, index=self.index)
 
 
 @dataclass(frozen=True)
@@ -335,13 +337,15 @@ class DirectTracker:
             pose = self._pose_of(best)
             self._overlap = self._overlaps_at(row, pose)
             done = self._follow(row, best.keyframe, pose, frame, history, best)
+        pose = orthonormalized(self.keyframes[done.attempt.keyframe].pose @ inverse(done.T_frame_reference))
         why = self._why_doubted(done)
+        if not why and best is not None and self._foretold is not None and self._is_untold(row, pose):
+            why = "it is not where constant speed foretold it, and other places look alike from there"
         if why:
             self._found = None
             self._keep_before(history)
             return self._lost(row, done.attempt, why, history)
         self._reference = done.attempt.keyframe
-        pose = orthonormalized(self.keyframes[self._reference].pose @ inverse(done.T_frame_reference))
         if not history.was_known:
             why = self._confirm(row, pose, done.attempt, history)
             if why:
@@ -429,7 +433,7 @@ class DirectTracker:
 
     def _why_doubted(self, done: Followed) -> str:
         """What speaks against a pose that fits; empty if nothing does."""
-        back, sigma = done.attempt.back, float(np.linalg.eigvalsh(done.covariance[:3, :3])[-1]) ** 0.5
+        back, sigma = done.attempt.back, weakest_sigma(done.covariance)
         if back is not None and back.agreement < self.config.lost_agreement:
             return f"looked at from the frame, only {back.agreement:.0%} of the keyframe's depth agrees"
         if back is not None and back.correlation < BACK_CORRELATION:
@@ -444,8 +448,12 @@ class DirectTracker:
             is_alike = other.measures.agreement > FOUND_AGREEMENT and other.cost < UNIQUE * attempt.cost
             if is_alike and _is_elsewhere(pose, self._pose_of(other)):
                 return True
+        return self._is_untold(row, pose)
+
+    def _is_untold(self, row: int, pose: np.ndarray) -> bool:
+        """Whether a frame does not tell where it is, and did not go on as it did, no period of the surface further."""
         if self._foretold is not None and motion_between(self._foretold, pose)[0] < SAME_STEP:
-            return False  # it goes on as it did: no period further
+            return False
         weights = self.config.grey_weight, self.config.depth_weight
         return difference_elsewhere(self.registrar, row, SCRATCH, weights, SAME_STEP) < TELLING
 
@@ -500,17 +508,15 @@ class DirectTracker:
             more=None if self._field is None else self._rows_of_map(self._field, W),
         )
         self._overlap = dict(zip(near, found.shares.tolist(), strict=True))
-        result = found.result
+        result, last = found.result, found.joined
+        if self._wants_features(last, best):
+            last = self._join_features(last, joint, joined, frame, history)
         attempt = replace(self._attempt(reference, result), moved=self._shift(row, task[0]["T"], result["T"]))
         if best is not None:
             attempt = replace(
                 attempt, cost=best.cost, measures=best.measures, grey_scale=best.grey_scale, moved=best.moved
             )
-        T, T_joint, back = (
-            np.asarray(result["T"], np.float64),
-            np.asarray(found.joined["T"], np.float64),
-            found.back,
-        )
+        T, T_joint, back = np.asarray(result["T"], np.float64), np.asarray(last["T"], np.float64), found.back
         if _is_elsewhere(T_joint, T):
             pair = self._pair_back(reference)
             T_joint, pair["T"] = T, inverse(T)
@@ -520,17 +526,15 @@ class DirectTracker:
             T_joint,
             Measures.of(result["record_0"]),
             self._depth_error(row, attempt),
-            covariance_of(np.asarray(found.joined["H"], np.float64)),
+            covariance_of(np.asarray(last["H"], np.float64)),
         )
 
-    def _rows_of_map(
-        self, field: FieldArrays, T_world_reference: np.ndarray
-    ) -> Callable[[wp.array, wp.array, int], None]:
+    def _rows_of_map(self, field: FieldArrays, T_world_reference: np.ndarray) -> Callable[[wp.array, wp.array], None]:
         """What writes the rows of the frame's points against the surface of the map."""
         map_rows = self._map_rows = self._map_rows or MapRows(self.registrar, 0, self.config.map_weight)
 
-        def add(pose: wp.array, rows: wp.array, at: int) -> None:
-            map_rows.add(field, pose, T_world_reference, SCRATCH, rows, at)
+        def add(pose: wp.array, rows: wp.array) -> None:
+            map_rows.add(field, pose, T_world_reference, SCRATCH, rows, 0)
 
         return add
 
@@ -543,6 +547,49 @@ class DirectTracker:
         pair = records(registration.Pair)
         pair["keyframe"], pair["row"], pair["exposure"] = SCRATCH, self._row(self.keyframes[keyframe]), (1.0, 0.0)
         return pair
+
+    def _wants_features(self, last: np.ndarray, best: Attempt | None) -> bool:
+        """Whether features' rows should join those of the images, which came to ``last``."""
+        when = self.config.feature_rows
+        if when != "doubt" or not last["ok"]:
+            return when == "always" and bool(last["ok"])
+        return best is not None or weakest_sigma(covariance_of(np.asarray(last["H"], np.float64))) > WEAK_SIGMA
+
+    def _join_features(
+        self, last: np.ndarray, joint: Any, joined: Sequence[int], frame: AdmittedFrame, history: FrameHistory
+    ) -> np.ndarray:
+        """The joint registration with ``joined`` once more, with rows of features: its `registration.Result`."""
+        reference, first = joined[0], int(joint["others"][0])
+        W = self.keyframes[reference].pose
+        pose = W @ inverse(np.asarray(last["T"], np.float64))
+        picture = replace(self._picture(frame), motion=self._motion_at(pose, frame, history))
+        features = self._second.rows(picture, pose, self._likely(reference))
+        for _ in range(LINEARIZATIONS):
+            T = orthonormalized(np.asarray(last["T"], np.float64))
+            others = None if features is None else feature_rows(features, W, T)
+            if others is None:
+                break
+            joint["others"] = first + len(others)
+            self.registrar.put_rows(others, first)
+            last = self.registrar.join_again(joint, self._to_reference(reference, joined))
+            if not is_far(T, np.asarray(last["T"], np.float64)):
+                break
+        return last
+
+    def _motion_at(self, pose: np.ndarray, frame: AdmittedFrame, history: FrameHistory) -> FrameMotion:
+        """How the camera moved while it took a frame that is at ``pose``."""
+        motion, earlier = self._motions[frame.index], history.earlier(TWIST_STEPS - 1)
+        if (motion.depth_offset == 0.0 and motion.readout == 0.0) or earlier is None:
+            return motion
+        elapsed = frame.timestamp - history.timestamp(earlier)
+        if elapsed <= 0:
+            return motion
+        return motion.with_twist(twist_of(inverse(history.pose(earlier)) @ pose) / elapsed)
+
+    def _likely(self, reference: int) -> list[int]:
+        """Keyframes whose features a frame is matched with."""
+        likely = sorted(self._overlap.items(), key=lambda item: -item[1])
+        return list(dict.fromkeys([reference, *(k for k, _ in likely)]))[:WITNESS_KEYFRAMES]
 
     def _shift(self, row: int, a: np.ndarray, b: np.ndarray) -> float:
         """How far two transforms put points apart, about [px of the middle level]."""
@@ -575,6 +622,7 @@ class DirectTracker:
         limit = max(6.0, 2.0 * self._typical_scale)
         return (
             attempt.ok
+            and self._foretold is not None
             and m.agreement > config.sure_agreement
             and m.correlation > config.sure_correlation
             and m.view > 0.4
@@ -640,18 +688,19 @@ class DirectTracker:
 
     def _picture(self, frame: AdmittedFrame) -> Picture:
         """The frame as it comes back from a file."""
+        motion = self._motions[frame.index]
         if not self.device.is_cpu:
-            return Picture(frame.rgb, frame.depth)
-        return Picture.of(*self.images.current())
+            return Picture(frame.rgb, frame.depth, frame.index, motion)
+        return replace(Picture.of(*self.images.current()), index=frame.index, motion=motion)
 
     def _ask(self, picture: Picture, history: FrameHistory, foretold: np.ndarray) -> Witness | None:
         """What features say, if the frame follows one whose pose is known."""
         before = self._before
         if before is None or not history.was_known:
             return None
-        likely = sorted(self._overlap.items(), key=lambda item: -item[1])
-        keyframes = list(dict.fromkeys([self._reference, *(k for k, _ in likely)]))[:WITNESS_KEYFRAMES]
-        return self._second.locate(picture, before.picture, history.last_pose, foretold, keyframes)
+        keyframes = self._likely(self._reference)
+        earlier = replace(before.picture, motion=self._motions.get(before.index, NO_MOTION))
+        return self._second.locate(picture, earlier, history.last_pose, foretold, keyframes)
 
     def _judge(self, row: int, best: Attempt | None, witness: Witness | None) -> Attempt | None:
         """Where features say something else, a third measure decides: which of both answers the images fit better."""

@@ -1,0 +1,1 @@
+"""Attacks on the whole program, counted: see `tools.attacks.__main__`."""

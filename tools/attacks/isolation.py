@@ -1,0 +1,185 @@
+"""Many tries of one kind in a process of their own, so that what ends or hangs a process is counted, not suffered."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import resource
+import selectors
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+SECONDS = 20.0
+"""A try that takes longer hangs."""
+START_SECONDS = 600.0
+"""Until the first try begins: kernels may have to be compiled."""
+TYPED, UNTYPED, WRONG = "typed error", "untyped error", "wrong result"
+
+Attempt = Callable[[np.random.Generator], str]
+"""A try: says what came of it, raises an error of ours where the input was refused, and `AssertionError` where a result
+is wrong."""
+
+
+@dataclass
+class Account:
+    """What came of the tries of one kind."""
+
+    name: str
+    outcomes: Counter[str] = field(default_factory=Counter)
+    crashes: list[str] = field(default_factory=list)
+    hangs: list[str] = field(default_factory=list)
+    untyped: list[str] = field(default_factory=list)
+    wrong: list[str] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+    @property
+    def tries(self) -> int:
+        return sum(self.outcomes.values()) + len(self.crashes + self.hangs + self.untyped + self.wrong + self.lost)
+
+    @property
+    def failures(self) -> list[str]:
+        return [
+            f"{self.name}: {kind}: {text}"
+            for kind in ("crashes", "hangs", "untyped", "wrong", "lost")
+            for text in getattr(self, kind)
+        ]
+
+    def note(self, number: int, outcome: str, detail: str) -> None:
+        """One try that came back."""
+        if outcome == UNTYPED:
+            self.untyped.append(f"try {number}: {detail}")
+        elif outcome == WRONG:
+            self.wrong.append(f"try {number}: {detail}")
+        else:
+            self.outcomes[outcome] += 1
+
+
+def attack(name: str, module: str, count: int, *, seed: int = 0, build: str = "usual", memory_gb: float = 0) -> Account:
+    """``count`` tries of ``module.attempt``, or of ``module.prepare()``'s result, in child processes.
+
+    Args:
+        name: Of the account, and first argument of ``prepare``.
+        module: Python module.
+        count: Tries; each has a random generator of its own, by number.
+        seed: Of all of them.
+        build: Of the kernels: "usual"; "debug", which checks every access to an array on the CPU; or "ptx", the code
+            for CUDA, whose accesses `tools.gpu.ptx_on_cpu` checks.
+        memory_gb: More address space than this beyond what the process has when it starts ends in `MemoryError`.
+    """
+    account, start, done = Account(name), time.monotonic(), 0
+    with tempfile.TemporaryDirectory(prefix="warpslam-attacks-", ignore_cleanup_errors=True) as folder:
+        while done < count:
+            numbers = (seed, done, count, build, memory_gb)
+            done = _run_child(account, [name, module, *map(str, numbers)], done, folder)
+    account.seconds = time.monotonic() - start
+    return account
+
+
+def _run_child(account: Account, arguments: list[str], first: int, folder: str) -> int:
+    """Tries until the child ends; returns the number of the next one. What they write lies in ``folder``."""
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    child = subprocess.Popen(
+        [sys.executable, "-m", "tools.attacks.isolation", *arguments],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT, start_new_session=True,
+        env={**os.environ, "TMPDIR": folder, "PYTHONPATH": path},
+    )  # fmt: skip
+    assert child.stdout is not None and child.stderr is not None
+    running, texts, rest = first, b"", b""
+    limit = time.monotonic() + START_SECONDS
+    began = False
+    with selectors.DefaultSelector() as selector:
+        for stream in (child.stdout, child.stderr):
+            os.set_blocking(stream.fileno(), False)
+            selector.register(stream, selectors.EVENT_READ)
+        while selector.get_map():
+            ready = selector.select(max(limit - time.monotonic(), 0.0))
+            if not ready and time.monotonic() >= limit:
+                os.killpg(child.pid, signal.SIGKILL)
+                child.wait()
+                account.hangs.append(f"try {running}: nothing for {SECONDS:g} s")
+                return running + 1
+            for key, _ in ready:
+                data = os.read(key.fd, 1 << 16)
+                if not data:
+                    selector.unregister(key.fileobj)
+                elif key.fileobj is child.stderr:
+                    texts = (texts + data)[-4000:]
+                else:
+                    *lines, rest = (rest + data).split(b"\n")
+                    for line in lines:
+                        news = json.loads(line)
+                        running, limit, began = news["next"], time.monotonic() + SECONDS, True
+                        if "outcome" in news:
+                            account.note(news["try"], news["outcome"], news["detail"])
+    code = child.wait()
+    if code == 0:
+        return running
+    last = texts.decode(errors="replace").strip().splitlines()[-1:] or ["no word"]
+    if not began:
+        raise RuntimeError(f"{account.name}: the tries can't begin (exit {code}): {texts.decode(errors='replace')}")
+    account.crashes.append(f"try {running}: exit {code}: {last[0][:300]}")
+    return running + 1
+
+
+def main() -> None:
+    """The child: arguments are those of `attack`."""
+    name, module, seed, first, count, build, memory_gb = sys.argv[1:]
+    news = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)  # what anything prints is no news
+    import warp as wp
+
+    if build == "debug":
+        wp.config.mode = "debug"
+    wp.config.log_level = wp.LOG_ERROR
+    from warpslam.errors import WarpSlamError
+
+    home = importlib.import_module(module)
+    if build == "ptx":
+        from tools.gpu import ptx_on_cpu
+
+        ptx_on_cpu.install(check=True)
+    attempt: Attempt = home.prepare(name) if hasattr(home, "prepare") else home.attempt
+    if float(memory_gb):
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        size = pages * resource.getpagesize() + int(float(memory_gb) * 1e9)
+        resource.setrlimit(resource.RLIMIT_AS, (size, size))
+    news.write(json.dumps({"next": int(first)}) + "\n")
+    for number in range(int(first), int(count)):
+        detail = ""
+        with contextlib.suppress(FileNotFoundError):
+            os.remove(f"core.{os.getpid()}")
+        try:
+            outcome = attempt(np.random.default_rng([int(seed), number]))
+        except WarpSlamError as error:
+            outcome = TYPED
+            if len(str(error)) > 4000:
+                outcome, detail = WRONG, f"a message of {len(str(error))} letters"
+        except AssertionError as error:
+            outcome, detail = WRONG, f"{error} {_where(error)}"
+        except BaseException as error:
+            outcome, detail = UNTYPED, f"{type(error).__name__}: {str(error)[:200]} {_where(error)}"
+        news.write(json.dumps({"try": number, "outcome": outcome, "detail": detail, "next": number + 1}) + "\n")
+
+
+def _where(error: BaseException) -> str:
+    frames = traceback.extract_tb(error.__traceback__)
+    ours = [frame for frame in frames if "/warpslam/" in frame.filename] or frames
+    return f"({Path(ours[-1].filename).name}:{ours[-1].lineno})"
+
+
+if __name__ == "__main__":
+    main()

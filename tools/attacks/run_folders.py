@@ -1,0 +1,71 @@
+"""Run folders whose files somebody has altered: the commands that read them give a result or a line."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from tools.attacks import scene
+from tools.attacks.isolation import Attempt
+from tools.attacks.values import mutated_bytes, mutated_json
+from warpslam import cli
+from warpslam.cli.exit_codes import EXIT_UNEXPECTED
+from warpslam.pipeline.run import run
+from warpslam.runs.request import RunRequest, Source
+from warpslam.synthetic import SyntheticSequence, write_sequence
+
+_TEXTS = ("metrics.json", "timing.json", "frames.json", "input.json", "manifest.json")
+_OTHERS = ("config.yaml", "trajectory.tum", "ground_truth.tum", "frames.csv", "panels.npz")
+_COMMANDS = (("report",), ("eval",), ("check",), ("report",), ("run", "--resume"))
+
+
+def prepare(name: str) -> Attempt:
+    """One small run."""
+    home = Path(tempfile.mkdtemp(prefix="warpslam-attacks-"))
+    sequence = SyntheticSequence(1, 3, intrinsics=scene.CAMERA)
+    write_sequence(sequence, home / "sequence")
+    whole = home / "whole"
+    request = RunRequest(Source(str(home / "sequence")), overrides=scene.SMALL, preset="default", device="cpu")
+    run(request, whole)
+
+    def attempt(rng: np.random.Generator) -> str:
+        folder = home / "run"
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(whole, folder)
+        for _ in range(int(rng.integers(1, 3))):
+            _alter(folder, rng)
+        command, *options = _COMMANDS[rng.integers(0, len(_COMMANDS))]
+        said = io.StringIO()
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            try:
+                code = cli.main([command, *options, str(folder)])
+            except SystemExit as error:
+                code = int(error.code or 0)
+        text = said.getvalue()
+        assert "Traceback" not in text, "a traceback"
+        if code == EXIT_UNEXPECTED:
+            raise RuntimeError(text.strip()[-300:])
+        assert len(text) < 20000, f"{len(text)} letters"
+        return f"exit {code}"
+
+    return attempt
+
+
+def _alter(folder: Path, rng: np.random.Generator) -> None:
+    text = rng.random() < 0.6
+    path = folder / str(rng.choice(_TEXTS if text else _OTHERS))
+    if not path.is_file():
+        return
+    if rng.random() < 0.1:
+        path.unlink()
+    elif text and rng.random() < 0.7:
+        value = mutated_json(json.loads(path.read_text()), rng)
+        path.write_text(json.dumps(value))
+    else:
+        path.write_bytes(mutated_bytes(path.read_bytes(), rng))

@@ -1,0 +1,100 @@
+"""Files of strangers, read so that none hangs the program or fills its memory: regular ones, of a bounded size."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+MEGABYTE = 1 << 20
+TEXT_LIMIT = 64 * MEGABYTE
+YAML_LIMIT = MEGABYTE // 2
+_KINDS = {
+    stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
+    stat.S_IFDIR: "a folder",
+}  # fmt: skip
+
+
+def check_regular(path: str | Path, limit: float = float("inf")) -> int:
+    """Size of a file [bytes], which is a regular one: others may never end, or never begin.
+
+    Raises:
+        OSError: There is none, it is something else, or it is larger than ``limit``.
+    """
+    try:
+        found = os.stat(path)
+    except ValueError as error:  # a zero in its name
+        raise OSError(errno.EINVAL, str(error), str(path)) from None
+    if not stat.S_ISREG(found.st_mode):
+        kind = _KINDS.get(stat.S_IFMT(found.st_mode), "no file")
+        raise OSError(errno.EINVAL, f"is {kind}, expected a regular file", str(path))
+    if found.st_size > limit:
+        text = f"has {found.st_size / MEGABYTE:.1f} MB, expected at most {limit / MEGABYTE:g}"
+        raise OSError(errno.EFBIG, text, str(path))
+    return found.st_size
+
+
+def read_bytes(path: str | Path, limit: float) -> bytes:
+    """Content of a regular file.
+
+    Raises:
+        OSError: As `check_regular`, or it can't be read.
+    """
+    check_regular(path, limit)
+    # Something else may have come into its place; opened so, a pipe does not wait for its other end.
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    with os.fdopen(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "is no regular file", str(path))
+        try:
+            data = file.read(int(min(limit, 1 << 62)) + 1)
+        except MemoryError:
+            raise OSError(errno.ENOMEM, "does not fit into memory", str(path)) from None
+    if len(data) > limit:
+        raise OSError(errno.EFBIG, f"has more than {limit / MEGABYTE:g} MB", str(path))
+    return data
+
+
+def read_text(path: str | Path, limit: float = TEXT_LIMIT, encoding: str = "utf-8") -> str:
+    """Content of a regular file of text, with line feeds.
+
+    Raises:
+        OSError: As `read_bytes`.
+        UnicodeDecodeError: It is no text.
+    """
+    text = read_bytes(path, limit).decode(encoding)
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Without aliases, by which a kilobyte unfolds into gigabytes."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """As its parent has it."""
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            raise yaml.YAMLError(f"an alias (*{event.anchor[:50]}), which is not supported: write the value out")
+        return super().compose_node(parent, index)
+
+
+def load_yaml(text: str | bytes) -> Any:
+    """What yaml holds, in plain Python values.
+
+    Raises:
+        ValueError: It is no yaml, too long, or has aliases or values that can't be.
+    """
+    if len(text) > YAML_LIMIT:
+        raise ValueError(f"{len(text) / MEGABYTE:.1f} MB are no settings, expected at most {YAML_LIMIT / MEGABYTE:g}")
+    try:
+        return yaml.load(text, _PlainLoader)  # noqa: S506 (a SafeLoader)
+    except ValueError:
+        raise
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    # Its constructors of dates, numbers and booleans let all kinds of errors through.
+    except (yaml.YAMLError, AttributeError, KeyError, TypeError, OverflowError, IndexError) as error:
+        raise ValueError(" ".join(str(error).split()) or type(error).__name__) from error
