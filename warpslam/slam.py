@@ -165,7 +165,7 @@ class Slam:
         self.history.add(frame.timestamp, located)
         self._digest = digest
         found = self._estimate_timing(frame, account)
-        self._close_loops(account)
+        self._close_loops(frame, account)
         self._note_motion(frame)  # what is mapped and kept are images of one moment
         if located.status is FrameStatus.OK and self.config.mapping.enabled:
             is_keyframe = self._is_keyframe(frame)  # Sec. 3.4
@@ -370,11 +370,25 @@ class Slam:
                 direct.retime(change, known, estimator.first)
         return found.to_dict()
 
-    def _close_loops(self, account: _Account) -> None:
-        """Compare new keyframes with what was seen long ago, and mend the poses of all."""
-        if self.loops is not None and self.loops.has_new:
-            with account.timed("loops"):
-                self.loops.look(self.history)
+    def _close_loops(self, frame: AdmittedFrame, account: _Account) -> None:
+        """Compare new keyframes with what was seen long ago, mend the poses of all, and the map after them."""
+        if self.loops is None or not self.loops.has_new:
+            return
+        with account.timed("loops"):
+            closed = self.loops.look(self.history)
+        if closed is not None and self.config.mapping.enabled and not self.scene.is_empty:
+            with account.timed("remapping"):
+                self._map_again(self.loops, frame)
+
+    def _map_again(self, loops: LoopCloser, frame: AdmittedFrame) -> None:
+        """Have mapped what has moved by more than half a fine voxel; the next frame to be mapped waits for it."""
+        self.wait()
+        remapping = loops.remapping(self._seen, self.history, self.config)
+        if remapping is None:
+            return
+        task = MappingTask("again", frame.index, self.history.pose(frame.index), remapping=remapping)
+        self.scheduler.start(task, self.keyframes)
+        self._take_over(wait=self._is_due(frame))
 
     def _note_motion(self, frame: AdmittedFrame) -> None:
         """Rectify the current image by how the camera came to its pose; and tell a keyframe just before of what came
@@ -413,6 +427,8 @@ class Slam:
             if self.direct is not None:  # it may be one already
                 keyframes = [keyframe for keyframe in keyframes if keyframe.index != frame.index]
             self.scheduler.start(task, keyframes)
+            if self.loops is not None:
+                self.loops.made.note(frame.index, pose)
             self._seen.append(SeenDepth.of(frame.index, depth))
             account.losses.update(self._take_over(wait=is_first))
 
@@ -421,7 +437,11 @@ class Slam:
         finished = self.scheduler.finished(wait=wait)
         if finished is None:
             return {}
-        self._mapped, result = finished
+        index, result = finished
+        if result.again and self.loops is not None:
+            self.loops.note_remapped(len(result.window), result.seconds)
+            return result.losses
+        self._mapped = index
         if result.adjusted:
             self.history.correct(self._mapped, result.pose)
             for keyframe in self.keyframes:

@@ -233,7 +233,7 @@ def state_from_arrays(
         direct=_direct(fields, count, len(frames)),
         digest=digest,
         timing_state=_timing_state(fields, count),
-        loops=_loops(fields, len(frames)),
+        loops=_loops(fields, count, len(frames)),
         optimizer=_optimizer(fields),
     )
 
@@ -384,7 +384,7 @@ def _timing_state(fields: StateFields, frames: int) -> TimingState | None:
     return state
 
 
-def _loops(fields: StateFields, keyframes: int) -> LoopState | None:
+def _loops(fields: StateFields, count: int, keyframes: int) -> LoopState | None:
     header = fields.header.get("loops")
     if header is None:
         return None
@@ -399,6 +399,10 @@ def _loops(fields: StateFields, keyframes: int) -> LoopState | None:
             if not np.isfinite(array).all():
                 raise fields.damaged(f"loops_{kind}_{name}", "a number that is not finite")
             arrays[f"{kind}_{name}"] = array
+    made = arrays["made_frames"] = fields.array("loops_made_frames", np.int64, (None,)).copy()
+    if len(made) and (made.min() < 0 or made.max() >= count or len(np.unique(made)) < len(made)):
+        raise fields.damaged("loops_made_frames", f"frames up to {made.max()}, of {count}")
+    arrays["made_poses"] = fields.poses("loops_made_poses", len(made)).copy()
     try:
         seen = int(header["seen"])
         figures = {name: float(value) for name, value in header["figures"].items()}

@@ -15,12 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from warpslam.config import LoopConfig
+from warpslam.config import Config, LoopConfig
 from warpslam.loops.graph import LEAST_WEIGHT, PoseGraph, edges_from_arrays, edges_to_arrays, import_gtsam
 from warpslam.loops.retrieval import PlaceIndex, Words
 from warpslam.loops.verification import FeatureCache, Gate, Verdict, Verifier
+from warpslam.mapping.remapping import MOVED, MadePoses, Remapping, moved_views
 from warpslam.poses import inverse, motion_between
 from warpslam.scene.image_pool import ImagePool
+from warpslam.scene.mapped_views import SeenDepth
 from warpslam.tracking.direct.second import Picture
 from warpslam.tracking.direct.tracker import UNTOLD, DirectTracker
 from warpslam.trajectory import FrameHistory
@@ -42,7 +44,7 @@ LEAST_OVERLAP = 0.3
 """Share of a keyframe that another one must see for both to be compared without a word in common."""
 NEWS = 12.6
 """Squared Mahalanobis distance from which a loop is news, and the graph is solved: 95 % of errors are smaller."""
-MOVED = 0.001
+LEAST_MOVE = 0.001
 """Keyframes that move further count as moved [m]."""
 
 
@@ -51,7 +53,7 @@ class Closed:
     """What a keyframe's loops came to."""
 
     moved: int
-    """Keyframes that moved by more than `MOVED`."""
+    """Keyframes that moved by more than `LEAST_MOVE`."""
     largest: float
     """Distance that one moved at most [m]."""
 
@@ -82,6 +84,10 @@ class LoopFigures:
     """Keyframes that moved, summed over these."""
     largest_move_m: float = 0.0
     """Of one keyframe at once [m]."""
+    remapped: int = 0
+    """Times that a part of the map was made anew."""
+    remapped_keyframes: int = 0
+    """Keyframes that it was made of, summed over these."""
 
     @classmethod
     def of(cls, values: Mapping[str, float]) -> LoopFigures:
@@ -107,7 +113,9 @@ class LoopState:
     """All that the next keyframe depends on beside keyframes and images."""
 
     arrays: dict[str, np.ndarray]
-    """Edges: "tracked" and "loop", then "_pairs", "_transforms", "_covariances"."""
+    """Edges: "tracked" and "loop", then "_pairs", "_transforms", "_covariances"; and "made_frames", "made_poses" of
+    `MadePoses`.
+    """
     seen: int
     """Keyframes that were looked at."""
     figures: dict[str, float]
@@ -134,8 +142,11 @@ class LoopCloser:
         self.features = FeatureCache(tracker, images)
         self.verifier = Verifier(tracker, self.features)
         self.figures = LoopFigures()
+        self.made = MadePoses()
         self.seconds = 0.0
         """Spent since the start, or since the last resume."""
+        self.remapping_seconds = 0.0
+        """The same, of mapping anew."""
         self.log: list[dict[str, Any]] = []
         """Candidates and what became of them, since the start or the last resume."""
         tracker.hooks = self
@@ -174,6 +185,7 @@ class LoopCloser:
         """Compare the keyframes that are new since the last call; what that changed, None if nothing."""
         start, closed = time.perf_counter(), None
         keyframes = self.tracker.keyframes
+        self.made.note_new(keyframes)
         for number in range(len(self.index), len(keyframes)):
             words = self._take_up_one(number)
             self.figures.keyframes += 1
@@ -251,12 +263,36 @@ class LoopCloser:
         poses = {k: pose for k, pose in enumerate(solution.poses) if k >= self.tracker.fixed}
         self.tracker.move_keyframes(poses, history)
         steps = np.linalg.norm(solution.poses[:, :3, 3] - before[:, :3, 3], axis=1)
-        closed = Closed(int((steps > MOVED).sum()), float(steps.max()))
+        closed = Closed(int((steps > LEAST_MOVE).sum()), float(steps.max()))
         figures = self.figures
         figures.solved += 1
         figures.moved_keyframes += closed.moved
         figures.largest_move_m = max(figures.largest_move_m, closed.largest)
         return closed
+
+    def remapping(self, seen: Sequence[SeenDepth], history: FrameHistory, config: Config) -> Remapping | None:
+        """What must be mapped anew, given what mapped frames saw; None if nothing. It counts as done from now on."""
+        least = MOVED * config.grid.fine_spacing
+        poses = [history.pose(one.index) for one in seen]
+        moved = moved_views(self.made, seen, poses, least)
+        if not moved:
+            return None
+        keyframes, tracker = self.tracker.keyframes, self.tracker
+        shifts = [self.made.shift(one.index, one.pose, tracker.mean_depth(k)) for k, one in enumerate(keyframes)]
+        for view in moved:
+            self.made.note(view.index, view.after)
+        for one, shift in zip(keyframes, shifts, strict=True):
+            if shift > least:
+                self.made.note(one.index, one.pose)
+        iterations = round(config.loops.remapping * config.mapping.iterations)
+        number = self.figures.remapped
+        self.figures.remapped += 1
+        return Remapping(tracker.camera, moved, np.array(shifts), least, max(iterations, 1), number)
+
+    def note_remapped(self, keyframes: int, seconds: float) -> None:
+        """What `remapping` returned is done."""
+        self.figures.remapped_keyframes += keyframes
+        self.remapping_seconds += seconds
 
     def _holds_near(self, i: int, j: int) -> bool:
         """Whether a loop joins the surroundings of two keyframes."""
@@ -269,6 +305,7 @@ class LoopCloser:
     def take_up(self) -> None:
         """Keyframes that come from a file which knows of no loops: they lie to each other as they do."""
         keyframes = self.tracker.keyframes
+        self.made.note_new(keyframes)
         for number in range(len(self.index), len(keyframes)):
             self._take_up_one(number)
             if number:
@@ -286,13 +323,19 @@ class LoopCloser:
         """Figures for metrics.json."""
         frames = [keyframe.index for keyframe in self.tracker.keyframes]
         edges = [[frames[i], frames[j]] for i, j in self.graph.loops]
-        return {**vars(self.figures), "edges": edges, "seconds": self.seconds}
+        return {
+            **vars(self.figures),
+            "edges": edges,
+            "seconds": self.seconds,
+            "remapping_seconds": self.remapping_seconds,
+        }
 
     def state(self) -> LoopState:
         """All of it as arrays."""
         arrays: dict[str, np.ndarray] = {}
         for kind, edges in (("tracked", self.graph.tracked), ("loop", self.graph.loops)):
             arrays |= {f"{kind}_{name}": array for name, array in edges_to_arrays(edges).items()}
+        arrays |= {f"made_{name}": array for name, array in self.made.arrays().items()}
         return LoopState(arrays, len(self.index), dict(vars(self.figures)))
 
     def restore(self, state: LoopState) -> None:
@@ -302,4 +345,5 @@ class LoopCloser:
             edges.update(edges_from_arrays(*(state.arrays[f"{kind}_{name}"] for name in names)))
         for number in range(state.seen):
             self._take_up_one(number)
+        self.made.restore(state.arrays["made_frames"], state.arrays["made_poses"])
         self.figures = LoopFigures.of(state.figures)

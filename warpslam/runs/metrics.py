@@ -167,8 +167,11 @@ class Loops(_Part):
     solved: int = Field(0, description="times that poses were mended")
     moved_keyframes: int = Field(0, description="keyframes that moved, summed over these")
     largest_move_m: Number = Field(None, description="of one keyframe at once [m]")
+    remapped: int = Field(0, description="times that a part of the map was made anew")
+    remapped_keyframes: int = Field(0, description="keyframes that it was made of, summed over these")
     edges: list[tuple[int, int]] = Field(default_factory=list, description="loops: frames among those processed")
     seconds: Number = Field(None, description="spent, since the start or the last resume [s]")
+    remapping_seconds: Number = Field(None, description="spent on making the map anew, likewise [s]")
 
     @property
     def text(self) -> str:
@@ -179,7 +182,8 @@ class Loops(_Part):
         return (
             f"{self.candidates} pairs of keyframes compared; {passed}; {len(self.edges)} loops hold; poses mended "
             f"{self.solved} times, {self.moved_keyframes} keyframes moved, by up to "
-            f"{100 * (self.largest_move_m or 0):.1f} cm; {self.seconds or 0:.1f} s"
+            f"{100 * (self.largest_move_m or 0):.1f} cm; {self.seconds or 0:.1f} s; made anew {self.remapped} times of "
+            f"{self.remapped_keyframes} keyframes, {self.remapping_seconds or 0:.1f} s"
         )
 
 

@@ -1008,6 +1008,10 @@ class DirectTracker:
         """Row of a keyframe's images, built if they are gone; it holds until `CACHED` others were asked for."""
         return self._row(self.keyframes[number])
 
+    def mean_depth(self, number: int) -> float:
+        """Of what a keyframe sees [m]."""
+        return self._mean_depth[number]
+
     def row_of(self, index: int) -> int | None:
         """Where the images of a frame are; None if they are gone."""
         return self._row_of.get(index)
