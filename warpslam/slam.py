@@ -47,6 +47,9 @@ from warpslam.trajectory import TWIST_STEPS, FrameHistory, Located, Trajectory
 if TYPE_CHECKING:
     import trimesh
 
+PART_GAP = 1.0
+"""Between a map and a part that is mapped beside it [m]."""
+
 
 class Slam:
     """A camera that moves through a scene, and the map it makes.
@@ -333,6 +336,8 @@ class Slam:
             return Located(pose)
         with account.timed("tracking"):
             located = self._track(frame)
+            if self._begins_elsewhere(frame, located):
+                located = self._begin_part(frame)
         if located.loss is not None:
             account.losses["tracking"] = located.loss
         return located
@@ -342,6 +347,27 @@ class Slam:
             return self.direct.locate(frame, self.history, None if self.scene.is_empty else self.scene.arrays())
         self.images.rectify_current(self._motion(frame))
         return self.localizer.locate(self.scene.arrays(), self.images, frame.index, self.history, self.keyframes)
+
+    def _begins_elsewhere(self, frame: AdmittedFrame, located: Located) -> bool:
+        """Whether a camera that was switched on in a map has recognised nothing for long enough to be mapped apart."""
+        after = self.config.loops.own_part_after
+        if self.loops is None or self.direct is None or self.direct.fixed or not after or not located.why_lost:
+            return False
+        return not self.direct.is_confirming and self.history.lost_since_break + 1 >= after
+
+    def _begin_part(self, frame: AdmittedFrame) -> Located:
+        """A part of the map on its own, beside what there is, which a loop may join later."""
+        assert self.direct is not None
+        pose, reach = np.eye(4), self.config.grid.max_depth
+        pose[0, 3] = max(keyframe.pose[0, 3] for keyframe in self.keyframes) + 2.0 * reach + PART_GAP
+        if not self.scene.is_empty:
+            pose[0, 3] = self.scene.high[0] + reach + PART_GAP
+            try:
+                self.scene.check_growth(*measured_extent(frame.depth, pose, self.intrinsics))
+            except MapSizeError as error:
+                return Located(self.history.last_pose, f"nothing is recognised, and beside what is mapped {error}")
+        self.direct.place(frame, pose, is_apart=True)
+        return Located(pose, after_loss=True)
 
     @property
     def _has_begun(self) -> bool:

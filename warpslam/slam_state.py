@@ -389,7 +389,7 @@ def _loops(fields: StateFields, count: int, keyframes: int) -> LoopState | None:
     if header is None:
         return None
     arrays = {}
-    for kind in ("tracked", "loop"):
+    for kind in ("tracked", "loop", "bridge"):
         pairs = fields.array(f"loops_{kind}_pairs", np.int64, (None, 2)).copy()
         if len(pairs) and (pairs.min() < 0 or pairs.max() >= keyframes or (pairs[:, 0] >= pairs[:, 1]).any()):
             raise fields.damaged(f"loops_{kind}_pairs", f"pairs of keyframes up to {pairs.max()}, of {keyframes}")

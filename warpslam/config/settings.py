@@ -280,6 +280,12 @@ class LoopConfig(_Group):
     drift_floor: float = Field(0.2, ge=0, description="and on no way at all [m]")
     turn_drift: float = Field(0.5, ge=0, description="the same as an angle, for a metre of way [degrees]")
     turn_floor: float = Field(5.0, ge=0, description="and on no way at all [degrees]")
+    own_part_after: int = Field(
+        10,
+        ge=0,
+        description="frames of a camera switched on in a map, in which it recognises nothing, after which it is mapped "
+        "on its own, until a place is recognised; 0 = never",
+    )
     remapping: float = Field(
         1.0, gt=0, description="iterations where the map is made anew, as a multiple of those that went into it"
     )

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from warpslam.config import Config, LoopConfig
-from warpslam.loops.graph import LEAST_WEIGHT, PoseGraph, edges_from_arrays, edges_to_arrays, import_gtsam
+from warpslam.loops.graph import LEAST_WEIGHT, Edge, PoseGraph, edges_from_arrays, edges_to_arrays, import_gtsam
 from warpslam.loops.retrieval import PlaceIndex, Words
 from warpslam.loops.verification import FeatureCache, Gate, Verdict, Verifier
 from warpslam.mapping.remapping import MOVED, MadePoses, Remapping, moved_views
-from warpslam.poses import inverse, motion_between
+from warpslam.poses import inverse, motion_between, orthonormalized
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.mapped_views import SeenDepth
 from warpslam.tracking.direct.second import Picture
@@ -44,6 +44,8 @@ LEAST_OVERLAP = 0.3
 """Share of a keyframe that another one must see for both to be compared without a word in common."""
 NEWS = 12.6
 """Squared Mahalanobis distance from which a loop is news, and the graph is solved: 95 % of errors are smaller."""
+JOINED = 0.1, 3.0
+"""Loops between two parts that say the same of how they lie differ by less [m], [degrees]."""
 LEAST_MOVE = 0.001
 """Keyframes that move further count as moved [m]."""
 
@@ -84,6 +86,8 @@ class LoopFigures:
     """Keyframes that moved, summed over these."""
     largest_move_m: float = 0.0
     """Of one keyframe at once [m]."""
+    joined: int = 0
+    """Times that two parts were joined."""
     remapped: int = 0
     """Times that a part of the map was made anew."""
     remapped_keyframes: int = 0
@@ -113,8 +117,8 @@ class LoopState:
     """All that the next keyframe depends on beside keyframes and images."""
 
     arrays: dict[str, np.ndarray]
-    """Edges: "tracked" and "loop", then "_pairs", "_transforms", "_covariances"; and "made_frames", "made_poses" of
-    `MadePoses`.
+    """Edges: "tracked", "loop" and "bridge", then "_pairs", "_transforms", "_covariances"; and of `MadePoses`,
+    "made_frames" and "made_poses".
     """
     seen: int
     """Keyframes that were looked at."""
@@ -189,7 +193,9 @@ class LoopCloser:
         for number in range(len(self.index), len(keyframes)):
             words = self._take_up_one(number)
             self.figures.keyframes += 1
-            news = [(other, number) for other in self._candidates(number, words) if self._compare(other, number)]
+            news = [
+                (other, number) for other in self._candidates(number, words) if self._compare(other, number, history)
+            ]
             if news:
                 closed = self._solve(news, history) or closed
         self.seconds += time.perf_counter() - start
@@ -203,6 +209,10 @@ class LoopCloser:
         near = {k: share for k, share in self.tracker.overlap.items() if k < before and self._is_expected(k, number)}
         expected = sorted(near, key=lambda k: -near[k])[:1]
         alike = self.index.likeliest(words, self.config.candidates, before, least=STAND_OUT)
+        parts = self.graph.parts(number + 1)
+        others = parts[:before] != parts[number]
+        if others.any():  # of other parts, too: nothing tells which of their places are near
+            alike += self.index.likeliest(words, self.config.candidates, before, least=STAND_OUT, among=others)
         found: list[int] = []
         for k in [*expected, *alike]:
             if not self.graph.are_linked(k, number) and all(abs(k - other) > NEXT_TO for other in found):
@@ -215,7 +225,7 @@ class LoopCloser:
         step, turn = motion_between(keyframes[old].pose, keyframes[new].pose)
         return bool(self.tracker.overlap.get(old, 0.0) > LEAST_OVERLAP and step < NEAR[0] and turn < NEAR[1])
 
-    def _compare(self, old: int, new: int) -> bool:
+    def _compare(self, old: int, new: int, history: FrameHistory) -> bool:
         """Whether a pair is a loop that says something new."""
         poses = self.tracker.keyframes
         expected = inverse(poses[old].pose) @ poses[new].pose
@@ -232,9 +242,49 @@ class LoopCloser:
         self.log.append({"frames": frames, "gate": str(verdict.gate), "why": verdict.why, "T": verdict.T_a_b})
         if verdict.gate is not Gate.PASSED or verdict.T_a_b is None or verdict.covariance is None:
             return False
+        if not np.isfinite(self.graph.way(new, len(poses))[old]):
+            self.graph.bridge(old, new, verdict.T_a_b, verdict.covariance)
+            return self._join(old, new, history)
         self.graph.close(old, new, verdict.T_a_b, verdict.covariance)
         edge = self.graph.loops[old, new]
         return edge.squared_error(poses[old].pose, poses[new].pose) > NEWS
+
+    def _join(self, old: int, new: int, history: FrameHistory) -> bool:
+        """Join the parts of two keyframes if another loop between them says the same: the later part goes to where the
+        loop has it. Whether it did.
+        """
+        keyframes = self.tracker.keyframes
+        parts = self.graph.parts(len(keyframes))
+        moved, held = sorted((new, old), key=lambda k: -int(parts[k]))
+
+        def moves(pair: tuple[int, int], edge: Edge) -> np.ndarray | None:
+            """What takes the later part to where a loop has it, (4, 4)."""
+            T = edge.T_i_j
+            if [parts[k] for k in pair] == [parts[moved], parts[held]]:
+                pair, T = (pair[1], pair[0]), inverse(T)
+            if [parts[k] for k in pair] != [parts[held], parts[moved]]:
+                return None
+            return orthonormalized(keyframes[pair[0]].pose @ T @ inverse(keyframes[pair[1]].pose))
+
+        own = min(old, new), max(old, new)
+        T_new_old = moves(own, self.graph.bridges[own])
+        assert T_new_old is not None
+        agreed = [own]
+        for pair, edge in self.graph.bridges.items():
+            T = moves(pair, edge)
+            if pair == own or T is None:
+                continue
+            step, turn = motion_between(T @ keyframes[moved].pose, T_new_old @ keyframes[moved].pose)
+            if step < JOINED[0] and turn < JOINED[1]:
+                agreed.append(pair)
+        if len(agreed) < 2:
+            return False
+        later = np.flatnonzero(parts == parts[moved]).tolist()
+        self.tracker.move_keyframes({k: orthonormalized(T_new_old @ keyframes[k].pose) for k in later}, history)
+        for pair in agreed:
+            self.graph.loops[pair] = self.graph.bridges.pop(pair)
+        self.figures.joined += 1
+        return True
 
     def _why_implausible(self, old: int, new: int, T_a_b: np.ndarray, expected: np.ndarray) -> str:
         """Whether tracking would have to have drifted too far; empty if not."""
@@ -323,8 +373,10 @@ class LoopCloser:
         """Figures for metrics.json."""
         frames = [keyframe.index for keyframe in self.tracker.keyframes]
         edges = [[frames[i], frames[j]] for i, j in self.graph.loops]
+        apart = int((self.graph.parts(len(frames)) > 0).sum()) if frames else 0
         return {
             **vars(self.figures),
+            "apart_keyframes": apart,
             "edges": edges,
             "seconds": self.seconds,
             "remapping_seconds": self.remapping_seconds,
@@ -333,15 +385,20 @@ class LoopCloser:
     def state(self) -> LoopState:
         """All of it as arrays."""
         arrays: dict[str, np.ndarray] = {}
-        for kind, edges in (("tracked", self.graph.tracked), ("loop", self.graph.loops)):
+        for kind, edges in self._edges:
             arrays |= {f"{kind}_{name}": array for name, array in edges_to_arrays(edges).items()}
         arrays |= {f"made_{name}": array for name, array in self.made.arrays().items()}
         return LoopState(arrays, len(self.index), dict(vars(self.figures)))
 
+    @property
+    def _edges(self) -> tuple[tuple[str, dict[tuple[int, int], Edge]], ...]:
+        graph = self.graph
+        return ("tracked", graph.tracked), ("loop", graph.loops), ("bridge", graph.bridges)
+
     def restore(self, state: LoopState) -> None:
         """Go on from what `state` returned; keyframes and images are restored already."""
         names = "pairs", "transforms", "covariances"
-        for kind, edges in (("tracked", self.graph.tracked), ("loop", self.graph.loops)):
+        for kind, edges in self._edges:
             edges.update(edges_from_arrays(*(state.arrays[f"{kind}_{name}"] for name in names)))
         for number in range(state.seen):
             self._take_up_one(number)

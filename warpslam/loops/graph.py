@@ -71,6 +71,8 @@ class PoseGraph:
     def __init__(self) -> None:
         self.tracked: dict[tuple[int, int], Edge] = {}
         self.loops: dict[tuple[int, int], Edge] = {}
+        self.bridges: dict[tuple[int, int], Edge] = {}
+        """Loops between parts that nothing else joins: each is believed only when another one says the same."""
 
     def track(self, i: int, j: int, T_i_j: np.ndarray, covariance: np.ndarray) -> None:
         """Tracking says how two keyframes lie to each other; what it said before is replaced."""
@@ -82,6 +84,14 @@ class PoseGraph:
         """A loop does."""
         self.loops[min(i, j), max(i, j)] = Edge.of(i, j, T_i_j, covariance, LOOP_FLOOR)
 
+    def bridge(self, i: int, j: int, T_i_j: np.ndarray, covariance: np.ndarray) -> None:
+        """A loop does, alone, of keyframes of two parts."""
+        self.bridges[min(i, j), max(i, j)] = Edge.of(i, j, T_i_j, covariance, LOOP_FLOOR)
+
+    def parts(self, count: int) -> np.ndarray:
+        """Part of each of ``count`` keyframes, by the number of its first one, int64 (count,)."""
+        return self._parts(count, self.loops)
+
     def settle(self, numbers: Collection[int], poses: Callable[[int], np.ndarray]) -> None:
         """Tracking has moved keyframes and believes how they lie to all others now; ``poses``: of a number, (4, 4)."""
         for (i, j), edge in self.tracked.items():
@@ -91,7 +101,7 @@ class PoseGraph:
     def are_linked(self, i: int, j: int) -> bool:
         """Whether there is an edge."""
         pair = min(i, j), max(i, j)
-        return pair in self.tracked or pair in self.loops
+        return pair in self.tracked or pair in self.loops or pair in self.bridges
 
     def way(self, start: int, count: int) -> np.ndarray:
         """Length of the shortest way along edges from one of ``count`` keyframes to each [m], infinite where there is
@@ -154,13 +164,16 @@ class PoseGraph:
 
     def _first_of_each_part(self, count: int, fixed: int, loops: Mapping[tuple[int, int], Edge]) -> list[int]:
         """First keyframe of each part of the graph that has none of the first ``fixed``."""
+        return [n for n in np.unique(self._parts(count, loops)).tolist() if n >= fixed]
+
+    def _parts(self, count: int, loops: Mapping[tuple[int, int], Edge]) -> np.ndarray:
         from scipy.sparse import coo_array
         from scipy.sparse.csgraph import connected_components
 
         i, j = np.array([*self.tracked, *loops], np.int64).reshape(-1, 2).T
         _, parts = connected_components(coo_array((np.ones(len(i)), (i, j)), (count, count)), directed=False)
-        _, first = np.unique(parts, return_index=True)
-        return sorted(n for n in first.tolist() if n >= fixed)
+        _, first, part = np.unique(parts, return_index=True, return_inverse=True)
+        return np.asarray(first[part.reshape(-1)], np.int64)
 
 
 def import_gtsam() -> Any:

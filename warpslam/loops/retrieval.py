@@ -75,7 +75,13 @@ class PlaceIndex:
         return np.bincount(entries[entries >= 0], minlength=self._count)
 
     def likeliest(
-        self, words: Words, count: int, before: int | None = None, apart: int = 2, least: float = 0.0
+        self,
+        words: Words,
+        count: int,
+        before: int | None = None,
+        apart: int = 2,
+        least: float = 0.0,
+        among: np.ndarray | None = None,
     ) -> list[int]:
         """Numbers of the images that share most words, the likeliest first.
 
@@ -84,10 +90,14 @@ class PlaceIndex:
             count: At most.
             before: Only images with lower numbers count.
             apart: Neighbours of one that was chosen, by number, are not.
+            among: Only images where it is true count, bool (before,).
             least: Multiple of the median of these that must be shared: unlike places share words, too.
         """
         shared = self.shared(words)[: self._count if before is None else max(before, 0)]
-        enough = least * float(np.median(shared)) if len(shared) else 0.0
+        if among is not None:
+            shared = np.where(among, shared, 0)
+        counted = shared if among is None else shared[among]
+        enough = least * float(np.median(counted)) if len(counted) else 0.0
         found: list[int] = []
         for n in np.argsort(-shared, kind="stable").tolist():
             if len(found) == count or shared[n] <= enough:

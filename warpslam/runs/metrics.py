@@ -167,6 +167,8 @@ class Loops(_Part):
     solved: int = Field(0, description="times that poses were mended")
     moved_keyframes: int = Field(0, description="keyframes that moved, summed over these")
     largest_move_m: Number = Field(None, description="of one keyframe at once [m]")
+    joined: int = Field(0, description="times that parts which nothing else joins were joined")
+    apart_keyframes: int = Field(0, description="keyframes of parts that nothing joins to the first one")
     remapped: int = Field(0, description="times that a part of the map was made anew")
     remapped_keyframes: int = Field(0, description="keyframes that it was made of, summed over these")
     edges: list[tuple[int, int]] = Field(default_factory=list, description="loops: frames among those processed")
@@ -179,11 +181,13 @@ class Loops(_Part):
         passed = ", ".join(
             f"{getattr(self, gate)} passed {gate}" for gate in ("geometry", "registration", "depth", "unique")
         )
+        apart = f"; {self.apart_keyframes} keyframes lie apart" if self.apart_keyframes else ""
+        joined = f"; parts joined {self.joined} times" if self.joined else ""
         return (
             f"{self.candidates} pairs of keyframes compared; {passed}; {len(self.edges)} loops hold; poses mended "
             f"{self.solved} times, {self.moved_keyframes} keyframes moved, by up to "
             f"{100 * (self.largest_move_m or 0):.1f} cm; {self.seconds or 0:.1f} s; made anew {self.remapped} times of "
-            f"{self.remapped_keyframes} keyframes, {self.remapping_seconds or 0:.1f} s"
+            f"{self.remapped_keyframes} keyframes, {self.remapping_seconds or 0:.1f} s{joined}{apart}"
         )
 
 

@@ -290,13 +290,15 @@ class DirectTracker:
 
     # -- what Slam asks ------------------------------------------------------------------------------------------
 
-    def place(self, frame: AdmittedFrame, pose: np.ndarray) -> None:
-        """A frame whose pose is given; it becomes a keyframe."""
+    def place(self, frame: AdmittedFrame, pose: np.ndarray, *, is_apart: bool = False) -> None:
+        """A frame whose pose is given; it becomes a keyframe. ``is_apart``: it says nothing of how the frame lies to
+        others.
+        """
         self._build_missing()
         self._load(frame)
         self._set_motion(frame.index, FrameMotion(depth_offset=frame.depth_offset, readout=self.readout))
         self._add_keyframe(frame.index, pose, self.images.keep_current())
-        if self._reference > 0:
+        if self._reference > 0 and not is_apart:
             before = self._reference - 1
             self._link(before, self._reference, inverse(self.keyframes[before].pose) @ pose, GIVEN)
         self._note(frame)
@@ -1007,6 +1009,11 @@ class DirectTracker:
     def keyframe_row(self, number: int) -> int:
         """Row of a keyframe's images, built if they are gone; it holds until `CACHED` others were asked for."""
         return self._row(self.keyframes[number])
+
+    @property
+    def is_confirming(self) -> bool:
+        """Whether a place was found that is not believed yet."""
+        return self._found is not None
 
     def mean_depth(self, number: int) -> float:
         """Of what a keyframe sees [m]."""
