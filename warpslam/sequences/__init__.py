@@ -39,11 +39,15 @@ DATASETS: tuple[str, ...] = tuple(_READERS)
 # What tells a format from the others: every group needs one match. The order matters: a ScanNet or Replica folder may
 # hold further files, while the last two formats are told by the names of two folders only.
 _SIGNS: dict[str, tuple[tuple[str, ...], ...]] = {
-    "replica": (("results/frame*.jpg", "results/frame*.png"), ("results/depth*.png",)),
-    "tum_rgbd": (("rgb.txt",), ("depth.txt",)),
-    "scannet": (("frames/color",), ("frames/depth",)),
+    "replica": (("results/frame*.jpg", "results/frame*.JPG", "results/frame*.png"), ("results/depth*.*",)),
+    "tum_rgbd": (("rgb.txt", "associat*.txt"), ("depth.txt", "associat*.txt")),
+    "scannet": (
+        ("frames/color", "color"),
+        ("frames/depth", "depth"),
+        ("frames/color", "pose/*.txt", "intrinsic/intrinsic_depth.txt"),
+    ),
     "cofusion": (("colour",), ("depth_noise",)),
-    "seven_scenes": (("frame-*.color.png",), ("frame-*.depth.png",)),
+    "seven_scenes": (("frame-*.color.png", "frame-*.color.jpg"), ("frame-*.depth.png",)),
     "icl": (("image",), ("depth",)),
     "azure": (("color",), ("depth",)),
 }

@@ -29,6 +29,20 @@ class Frame:
     """Time of the depth image [s], where it has one of its own."""
 
 
+@dataclass(frozen=True)
+class Remark:
+    """What a reader noticed in opening a sequence, for `warpslam check` and for the log of a run."""
+
+    check: str
+    """What it is about."""
+    message: str
+    """What is so, and where."""
+    remedy: str = ""
+    """What to do or type."""
+    is_fine: bool = False
+    """Nothing is lost by it; it is only said."""
+
+
 class RgbdSequence(ABC):
     """A random-access RGB-D sequence.
 
@@ -36,12 +50,14 @@ class RgbdSequence(ABC):
     intrinsics: Camera of the frames as returned, that is after undistortion, resizing and cropping.
     preset: Name of the settings that suit the sequence (see `warpslam.config.PRESETS`).
     timing: When the pixels of the frames, as returned, are taken.
+    remarks: What was noticed in opening it.
     """
 
     name: str
     intrinsics: Intrinsics
     preset: str = "default"
     timing: SensorTiming = ONE_MOMENT
+    remarks: tuple[Remark, ...] = ()
 
     @abstractmethod
     def __len__(self) -> int: ...

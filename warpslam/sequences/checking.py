@@ -17,7 +17,9 @@ import numpy as np
 from warpslam.errors import DatasetError, FrameError
 from warpslam.frames import exposure_fault, read_images
 from warpslam.sequences.base import Frame, RgbdSequence
-from warpslam.sequences.files import FileSequence, frame_number
+from warpslam.sequences.files import FileSequence
+from warpslam.sequences.images import ImageSequence
+from warpslam.sequences.pairing import frame_number
 from warpslam.sequences.pose_convention import CONVENTIONS, EXPECTED, DepthView, agreement, moving_pairs
 from warpslam.spread import spread
 
@@ -175,10 +177,10 @@ def _check_frames(samples: list[_Sample]) -> Iterator[Finding]:
 
 
 def _check_files(sequence: RgbdSequence, frames: Sequence[int], thorough: bool) -> Iterator[Finding]:
+    for remark in sequence.remarks:
+        yield Finding(remark.check, OK if remark.is_fine else WARNING, remark.message, remark.remedy)
     if not isinstance(sequence, FileSequence):
         return
-    for remark in sequence.remarks:
-        yield Finding("association", WARNING, remark, "complete the download, or go on with the frames that are left")
     numbers = [frame_number(sequence.files(index)[0]) for index in range(len(sequence))]
     known = [number for number in numbers if number is not None]
     steps = np.diff(known)
@@ -198,7 +200,7 @@ def _check_files(sequence: RgbdSequence, frames: Sequence[int], thorough: bool) 
             message = f"{len(bad)} image files are missing or empty: {named}"
             yield Finding("files", WARNING, message, "fetch these files again; their frames will be left out")
         else:
-            yield Finding("files", OK, f"all {2 * len(frames)} image files are there")
+            yield Finding("files", OK, "all image files are there")
 
 
 def _holds_something(path: Path) -> bool:
@@ -252,7 +254,7 @@ def _check_camera(sequence: RgbdSequence) -> Iterator[Finding]:
 
 def _camera_text(sequence: RgbdSequence, depth_scale: float | None = None) -> str:
     """The stored camera as ``--camera`` takes it."""
-    if not isinstance(sequence, FileSequence):
+    if not isinstance(sequence, ImageSequence):
         return "FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE"
     k = sequence.calibration.stored
     numbers = (k.fx, k.fy, k.cx, k.cy, k.width, k.height, depth_scale or sequence.calibration.depth_scale)
@@ -265,7 +267,7 @@ def _check_depth(sequence: RgbdSequence, frames: list[Frame], max_depth: float) 
     values = depth[depth > 0]
     median = float(np.median(values)) if len(values) else 0.0
     beyond = float(np.mean(values > max_depth)) if len(values) else 1.0
-    scale = sequence.calibration.depth_scale if isinstance(sequence, FileSequence) else None
+    scale = sequence.calibration.depth_scale if isinstance(sequence, ImageSequence) else None
     if beyond > 0.9 or not _DEPTH_RANGE[0] < median < _DEPTH_RANGE[1]:
         remedy = "check the unit of depth"
         fitting = [] if scale is None else [
@@ -351,7 +353,7 @@ def _check_convention(sequence: RgbdSequence, frames: Sequence[int], truth: np.n
         message = f"poses are read as {EXPECTED}, which {given:.0%} of the depth agrees with; as {best} it is "
         message += f"{scores[best]:.0%}"
         return Finding("pose convention", bad, message, "convert each 4x4 matrix T: " + "; ".join(steps))
-    if given < _SURE and isinstance(sequence, FileSequence):
+    if given < _SURE and isinstance(sequence, ImageSequence):
         # Every scale fits a little where the camera only turns, so another one has to fit clearly better.
         scale = sequence.calibration.depth_scale
         others = [known for known in KNOWN_DEPTH_SCALES if known != scale]

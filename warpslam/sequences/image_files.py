@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import zipfile
 import zlib
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,8 @@ from warpslam.errors import DatasetError, MissingDependencyError
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".exr", ".npy", ".npz")
+_STRAY_SHARE = 0.25  # of the files: more of another pattern are no strays, the folder is only untidy
 
 
 def natural_key(path: Path) -> list[tuple[int, str]]:
@@ -29,11 +33,28 @@ def list_images(folder: Path, pattern: str = "*", suffixes: tuple[str, ...] = IM
     if not folder.is_dir():
         raise DatasetError(f"{folder}: no such folder; the sequence is incomplete or of another format")
     # Files that start with a dot are thumbnails and resource forks, not frames.
-    files = [file for file in folder.glob(pattern) if file.suffix.lower() in suffixes and not file.name.startswith(".")]
+    there = [file for file in folder.glob(pattern) if not file.name.startswith(".")]
+    files = [file for file in there if file.suffix.lower() in suffixes]
     if not files:
-        wanted = " or ".join(pattern + suffix if pattern.endswith("*") else pattern for suffix in suffixes)
+        named = (pattern + suffix if pattern.endswith("*") else pattern for suffix in suffixes)
+        wanted = " or ".join(dict.fromkeys(named))
+        others = sorted({file.suffix.lower() for file in there if file.suffix and file.is_file()})
+        if others:
+            raise DatasetError(
+                f"{folder}: no images ({wanted}), but files of type {', '.join(others)}; convert them to one of these"
+            )
         raise DatasetError(f"{folder}: no images ({wanted}); check that the download is complete and unpacked")
     return sorted(files, key=natural_key)
+
+
+def without_strays(files: list[Path]) -> tuple[list[Path], list[Path]]:
+    """Frames, and files that are none: the few whose names, digits aside, are not like those of nearly all others."""
+    patterns = Counter(re.sub(r"\d+", "#", file.stem) for file in files)
+    usual, count = patterns.most_common(1)[0]
+    if count < 3 or len(files) - count > _STRAY_SHARE * len(files):
+        return files, []
+    frames = [file for file in files if re.sub(r"\d+", "#", file.stem) == usual]
+    return frames, [file for file in files if file not in set(frames)]
 
 
 def read_rgb(path: Path) -> np.ndarray:
@@ -46,20 +67,52 @@ def read_rgb(path: Path) -> np.ndarray:
 
 
 def read_depth(path: Path) -> np.ndarray:
-    """Stored depth values, uint16, shape (H, W)."""
+    """Stored depth values, uint16 or float32, shape (H, W): a PNG or TIFF image, EXR (channel Y, Z, R or the only one),
+    or an array of NumPy.
+
+    Raises:
+        MissingDependencyError: EXR needs the package openexr.
+        DatasetError: The file can't be read, or is no depth image.
+    """
     import cv2
 
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
-    if image.ndim != 2 or image.dtype != np.uint16:
-        channels = 1 if image.ndim == 2 else image.shape[2]
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
+        return read_exr(path, ("Y", "Z", "R", "V", "D"))
+    image = _read_array(path) if suffix in (".npy", ".npz") else _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim == 3 and 1 in (image.shape[0], image.shape[2]):
+        image = image.squeeze(0 if image.shape[0] == 1 else 2)
+    is_number = image.dtype == np.uint16 or (image.dtype.kind == "f" and image.dtype.itemsize <= 8)
+    if suffix in (".npy", ".npz") and image.dtype.kind in "iu":
+        image, is_number = image.astype(np.float32), True
+    if image.ndim != 2 or not is_number or not image.size:
+        channels = 1 if image.ndim == 2 else image.shape[-1] if image.ndim else 0
         raise DatasetError(
-            f"{path}: depth image has {channels} channel(s) of {image.dtype}; store depth as a one-channel 16-bit PNG"
+            f"{path}: depth image has {channels} channel(s) of {image.dtype}; store depth as a one-channel 16-bit PNG, "
+            "or as 32-bit float metres in a TIFF, EXR or NumPy file"
         )
-    return image
+    return image if image.dtype == np.uint16 else image.astype(np.float32)
 
 
-def read_exr(path: Path, channel: str = "Y") -> np.ndarray:
-    """One channel of an OpenEXR image, float32, shape (H, W).
+def _read_array(path: Path) -> np.ndarray:
+    """The array of a .npy file, or of a .npz file the one called depth, or its only one."""
+    import io
+
+    data = _read_bytes(path)
+    try:
+        loaded = np.load(io.BytesIO(data), allow_pickle=False)
+        if isinstance(loaded, np.ndarray):
+            return loaded
+        names = [name for name in loaded.files if "depth" in name.lower()] or loaded.files
+        if len(names) != 1:
+            raise DatasetError(f"{path}: holds {len(names)} arrays ({', '.join(names)}); keep one, or call it depth")
+        return loaded[names[0]]
+    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, SyntaxError, MemoryError) as error:
+        raise DatasetError(f"{path}: damaged or not a NumPy file ({error}); fetch the file again") from error
+
+
+def read_exr(path: Path, names: tuple[str, ...] = ("Y",)) -> np.ndarray:
+    """One channel of an OpenEXR image, float32, shape (H, W): the first of ``names`` that it has.
 
     Raises:
         MissingDependencyError: If the package openexr is not installed.
@@ -78,9 +131,11 @@ def read_exr(path: Path, channel: str = "Y") -> np.ndarray:
         pixels = {name: item.pixels for name, item in channels.items()}
     except (RuntimeError, ValueError, TypeError, OSError) as error:
         raise DatasetError(f"{path}: damaged EXR image ({error}); fetch the file again") from error
-    if channel not in pixels or pixels[channel] is None:
-        raise DatasetError(f"{path}: EXR image has no channel {channel} but {', '.join(sorted(pixels))}; is it depth?")
-    return np.asarray(pixels[channel], dtype=np.float32)
+    for name in names:
+        if pixels.get(name) is not None:
+            return np.asarray(pixels[name], dtype=np.float32)
+    wanted = " or ".join(names)
+    raise DatasetError(f"{path}: EXR image has no channel {wanted} but {', '.join(sorted(pixels))}; is it depth?")
 
 
 def _read_bytes(path: Path) -> bytes:
