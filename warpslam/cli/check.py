@@ -3,13 +3,27 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from warpslam.cli.common import add_command, add_format_options
+from warpslam.config import Config
+from warpslam.runs.given_poses import GivenPoses
+from warpslam.sequences.base import RgbdSequence
 from warpslam.sequences.checking import THOROUGH_SAMPLES, check_folder
 from warpslam.storage.json_files import to_json
 
 EXIT_FINDINGS = 1
+
+
+def _given(path: str, sequence: RgbdSequence) -> tuple[np.ndarray, Path]:
+    """Poses of a file for all frames of a sequence, and its path."""
+    frames = range(len(sequence))
+    given = GivenPoses.read(path).fitted_to(sequence, frames)
+    return given.of_frames(sequence, frames), given.path
 
 
 def add(commands: Any) -> None:
@@ -17,13 +31,26 @@ def add(commands: Any) -> None:
     check = add_command(commands, "check", _check, "whether a folder of RGB-D frames can be used, before a run")
     check.add_argument("folder", metavar="FOLDER", help="folder of one sequence")
     add_format_options(check)
+    check.add_argument("--poses", metavar="FILE", help="poses that a run would be given, checked against depth")
+    check.add_argument(
+        "--set", dest="overrides", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
+        help="settings of the run, such as scene_scale=0.1",
+    )  # fmt: skip
     check.add_argument("--all", action="store_true", help="read every frame, not a sample of them")
     check.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _check(options: argparse.Namespace) -> int:
     count = None if options.all else THOROUGH_SAMPLES
-    report = check_folder(options.folder, options.dataset, options.camera, sample_count=count)
+    max_depth = Config.from_preset("default", options.overrides).resolved().grid.max_depth
+    report = check_folder(
+        options.folder,
+        options.dataset,
+        options.camera,
+        sample_count=count,
+        max_depth=max_depth,
+        read_poses=None if options.poses is None else partial(_given, options.poses),
+    )
     if options.json:
         print(to_json(report.to_dict()))
     else:

@@ -5,6 +5,7 @@ Defaults are the published ones for Replica (released code; paper A.6) where not
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +17,7 @@ from warpslam.config.overrides import merge, parse_override
 from warpslam.config.presets import PRESETS
 from warpslam.errors import ConfigError
 
+_LENGTH = re.compile(r"\[(m|m\^2)\]")
 _FOLLOW_GIVEN_POSES = ("bundle_adjustment", "depth_start")  # of the mapping group, see `Config.resolved`
 
 
@@ -312,6 +314,13 @@ class Config(_Group):
         description="depth that is taken before or after colour, and rows that are taken one after the other, are "
         "corrected for where stamps or the camera tell; off = every pixel is taken at once (paper)",
     )
+    scene_scale: float = Field(
+        1.0,
+        ge=1e-3,
+        le=1e3,
+        description="size of the scene beside that of a room: all settings that are lengths are multiplied by it; 0.1 "
+        "suits an object on a table, 5 a hall",
+    )
     decoders: str | None = Field(None, description="decoder checkpoint; the package's own when empty")
 
     @classmethod
@@ -380,7 +389,27 @@ class Config(_Group):
             "bundle_adjustment": mapping.bundle_adjustment and not given and self.tracking.optimizer != "direct",
             "depth_start": given if mapping.depth_start is None else mapping.depth_start,
         }
-        return self.model_copy(update={"mapping": mapping.model_copy(update=derived)})
+        return self.model_copy(update={"mapping": mapping.model_copy(update=derived)})._at_scale()
+
+    def _at_scale(self) -> Config:
+        """These settings with every length multiplied by ``scene_scale``, which is then 1."""
+        scale = self.scene_scale
+        if scale == 1.0:
+            return self
+        changes: dict[str, Any] = {"scene_scale": 1.0}
+        for name, group in ((name, getattr(self, name)) for name in type(self).model_fields):
+            if isinstance(group, _Group):
+                fields = type(group).model_fields.items()
+                units = {field: _LENGTH.search(info.description or "") for field, info in fields}
+                powers = {field: 2 if unit[1] == "m^2" else 1 for field, unit in units.items() if unit}
+                lengths = {field: getattr(group, field) * scale**power for field, power in powers.items()}
+                changes[name] = group.model_copy(update=lengths)
+        tracking, imap = changes["tracking"], changes["imap"]
+        # The turn of a pose keeps its rate, and the network its units.
+        factor = tracking.rotation_rate_factor / scale
+        changes["tracking"] = tracking.model_copy(update={"rotation_rate_factor": factor})
+        changes["imap"] = imap.model_copy(update={"scale": imap.scale / scale})
+        return self.model_copy(update=changes)
 
     def with_files(self, decoders: str | None = None, poses: str | Path | None = None) -> Config:
         """These settings for a run that is given a decoder checkpoint, or a trajectory whose poses are taken as they

@@ -93,7 +93,7 @@ class FrameLoop:
                 before, last = last, frame.timestamp
                 if last <= before:
                     raise DatasetError(f"its time {last:.6f} s is not after {before:.6f} s, that of the frame before")
-                if self.given is not None and self.given.at(frame.timestamp) is None:
+                if self.given is not None and self.given.of(frame) is None:
                     raise DatasetError(f"{self.given.path} has no pose for {frame.timestamp:.3f} s")
             except DatasetError as error:
                 record.leave_out(index, str(error))
@@ -104,7 +104,7 @@ class FrameLoop:
     def _given_pose(self, frame: Frame, truth: np.ndarray) -> np.ndarray | None:
         """The pose (4, 4) that the method is told; NaN makes it skip the frame, and the run goes on."""
         if self.given is not None:
-            return self.given.at(frame.timestamp)
+            return self.given.of(frame)
         if self.poses_are_wanted:
             return truth
         return truth if self.world_is_known and np.isfinite(truth).all() else None

@@ -221,10 +221,22 @@ class Run:
         # Poses of a file take the place of the sequence's own, which then matter for the errors alone.
         poses_matter = self.config.tracking.use_given_poses and self.given is None
         if poses_matter and self.sequence.ground_truth() is None and self._first_pose() is None:
-            raise ConfigError(f"tracking.use_given_poses is on, but {self.sequence.name} has no poses; switch it off")
+            raise ConfigError(
+                f"tracking.use_given_poses is on, but {self.sequence.name} has no poses; give them with --poses FILE, "
+                "or leave that setting out"
+            )
         with self.record.clock("checking"):
+            given = None
+            if self.given is not None:
+                self.given = self.given.fitted_to(self.sequence, self.selected)
+                given = self.given.of_frames(self.sequence, self.selected)
             findings = check_sequence(
-                self.sequence, self.selected, max_depth=self.config.grid.max_depth, poses_matter=poses_matter
+                self.sequence,
+                self.selected,
+                max_depth=self.config.grid.max_depth,
+                poses_matter=poses_matter,
+                given_poses=given,
+                given_path=None if self.given is None else self.given.path,
             )
         bad = [finding for finding in findings if finding.severity != OK]
         self.metrics.fill({"input_checks": [vars(finding) for finding in bad]})

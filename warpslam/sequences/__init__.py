@@ -17,10 +17,15 @@ _READERS = {
     "scannet": "ScanNetSequence",
     "cofusion": "CoFusionSequence",
     "seven_scenes": "SevenScenesSequence",
+    "icl_nuim": "IclNuimSequence",
+    "sun3d": "Sun3dSequence",
+    "stray": "StraySequence",
+    "transforms": "TransformsSequence",
     "icl": "RedwoodSequence",
     "azure": "AzureSequence",
+    "video": "VideoFolderSequence",
 }
-_MODULES = {"icl": "redwood"}
+_MODULES = {"icl": "redwood", "video": "video_folder"}
 _ALIASES = {
     "tum": "tum_rgbd",
     "tumrgbd": "tum_rgbd",
@@ -39,6 +44,7 @@ DATASETS: tuple[str, ...] = tuple(_READERS)
 # What tells a format from the others: every group needs one match. The order matters: a ScanNet or Replica folder may
 # hold further files, while the last two formats are told by the names of two folders only.
 _SIGNS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "icl_nuim": (("associat*.txt",), ("*.freiburg",)),
     "replica": (("results/frame*.jpg", "results/frame*.JPG", "results/frame*.png"), ("results/depth*.*",)),
     "tum_rgbd": (("rgb.txt", "associat*.txt"), ("depth.txt", "associat*.txt")),
     "scannet": (
@@ -48,8 +54,12 @@ _SIGNS: dict[str, tuple[tuple[str, ...], ...]] = {
     ),
     "cofusion": (("colour",), ("depth_noise",)),
     "seven_scenes": (("frame-*.color.png", "frame-*.color.jpg"), ("frame-*.depth.png",)),
+    "sun3d": (("image",), ("depth",), ("intrinsics.txt",), ("extrinsics",)),
+    "stray": (("camera_matrix.csv",), ("depth",), ("odometry.csv", "rgb.mp4")),
+    "transforms": (("transforms.json",),),
     "icl": (("image",), ("depth",)),
     "azure": (("color",), ("depth",)),
+    "video": (tuple(f"*{suffix}" for suffix in (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")), ("depth",)),
 }
 
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from warpslam.sequences.base import Remark
 from warpslam.sequences.calibration import Calibration
-from warpslam.sequences.image_files import read_depth, read_rgb
+from warpslam.sequences.image_files import read_depth, read_grey, read_rgb
 from warpslam.sequences.images import ImageSequence
+from warpslam.sequences.video import Video
 
 
 class FileSequence(ImageSequence):
@@ -20,13 +21,17 @@ class FileSequence(ImageSequence):
     Args:
         folder: Folder of the sequence; gives it its name.
         calibration: Camera of the stored images.
-        rgb_files: Colour images.
+        rgb_files: Colour images; or a video, with ``video_frames``.
         depth_files: Depth images, as many.
         poses: As in `ImageSequence`, and so are the others.
         timestamps: Times [s], shape (N,).
         depth_timestamps: Times of the depth images [s], shape (N,).
         remarks: What was noticed in making the list of frames.
         same_view: Colour and depth are known to have the same field of view, whatever their sizes.
+        conventions: As in `ImageSequence`.
+        confidence_files: Images, as many, that are 0 where depth is no measurement.
+
+        video_frames: Number of each frame in the video, int (N,); 0, 1, 2, ... if None.
 
     Raises:
         DatasetError: There are no frames, or none of the first can be read and fits the camera.
@@ -36,7 +41,7 @@ class FileSequence(ImageSequence):
         self,
         folder: Path,
         calibration: Calibration,
-        rgb_files: Sequence[Path],
+        rgb_files: Sequence[Path] | Video,
         depth_files: Sequence[Path],
         *,
         poses: np.ndarray | None = None,
@@ -44,8 +49,15 @@ class FileSequence(ImageSequence):
         depth_timestamps: np.ndarray | None = None,
         remarks: Sequence[Remark] = (),
         same_view: bool = False,
+        conventions: Sequence[str] = (),
+        confidence_files: Sequence[Path] | None = None,
+        video_frames: np.ndarray | None = None,
     ) -> None:
-        self._rgb_files, self._depth_files = list(rgb_files), list(depth_files)
+        self._video = rgb_files if isinstance(rgb_files, Video) else None
+        self._rgb_files = [rgb_files.path] * len(depth_files) if isinstance(rgb_files, Video) else list(rgb_files)
+        self._video_frames = np.arange(len(depth_files)) if video_frames is None else video_frames
+        self._depth_files = list(depth_files)
+        self._confidence_files = None if confidence_files is None else list(confidence_files)
         super().__init__(
             typed_name(folder),
             calibration,
@@ -55,6 +67,7 @@ class FileSequence(ImageSequence):
             depth_timestamps=depth_timestamps,
             remarks=remarks,
             same_view=same_view,
+            conventions=conventions,
         )
 
     def files(self, index: int) -> tuple[Path, ...]:
@@ -70,10 +83,17 @@ class FileSequence(ImageSequence):
         return self.metres(read_depth(path))
 
     def _stored_rgb(self, index: int) -> np.ndarray:
+        if self._video is not None:
+            return self._video[int(self._video_frames[index])]
         return read_rgb(self._rgb_files[index])
 
     def _stored_depth(self, index: int) -> np.ndarray:
-        return self.read_depth_metres(self._depth_files[index])
+        depth = self.read_depth_metres(self._depth_files[index])
+        if self._confidence_files is not None:
+            confidence = read_grey(self._confidence_files[index])
+            if confidence.shape == depth.shape:
+                depth = np.where(confidence > 0, depth, np.float32(0))
+        return depth
 
 
 def typed_name(path: Path) -> str:

@@ -66,6 +66,16 @@ def read_rgb(path: Path) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
+def read_grey(path: Path) -> np.ndarray:
+    """One-channel image of 8 bits, uint8, shape (H, W), such as a mask."""
+    import cv2
+
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2:
+        raise DatasetError(f"{path}: has {image.shape[2]} channels, expected one; write it as a grey image")
+    return image.astype(np.uint8)
+
+
 def read_depth(path: Path) -> np.ndarray:
     """Stored depth values, uint16 or float32, shape (H, W): a PNG or TIFF image, EXR (channel Y, Z, R or the only one),
     or an array of NumPy.

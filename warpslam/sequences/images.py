@@ -17,10 +17,12 @@ from warpslam.errors import DatasetError
 from warpslam.sequences.base import Frame, Remark, RgbdSequence
 from warpslam.sequences.calibration import Calibration
 from warpslam.sequences.placeholders import without_placeholders
+from warpslam.sequences.pose_convention import CONVENTIONS, agreement, posed_pairs
 from warpslam.sequences.registration import axis_depth, color_at_depth, register_depth
 
 FRAME_RATE = 30.0
 _FIRST_FRAMES = 10
+_CLEARLY = 0.1  # more of the depth agrees with another convention
 _SAME_SHAPE = 0.02  # difference of width over height up to which two images can have the same field of view
 
 
@@ -38,6 +40,8 @@ class ImageSequence(RgbdSequence):
         depth_timestamps: Times of the depth images [s], shape (N,), where they have their own.
         remarks: What was noticed in making the list of frames.
         same_view: Colour and depth are known to have the same field of view, whatever their sizes.
+        conventions: Of `pose_convention.CONVENTIONS`, what poses may be stored as, most likely first; the one that
+            depth agrees with is taken. None: they are as said above.
 
     Raises:
         DatasetError: There are no frames, or none of the first can be read and fits the camera.
@@ -54,6 +58,7 @@ class ImageSequence(RgbdSequence):
         depth_timestamps: np.ndarray | None = None,
         remarks: Sequence[Remark] = (),
         same_view: bool = False,
+        conventions: Sequence[str] = (),
     ) -> None:
         if not count:
             raise DatasetError(f"{name}: no frames; check that the download is complete and unpacked")
@@ -72,6 +77,20 @@ class ImageSequence(RgbdSequence):
         if self._poses is not None:
             self._poses, found = without_placeholders(self._poses, self._stored_rgb)
             self.remarks += found
+        if self._poses is not None and conventions:
+            self._choose_convention(conventions)
+
+    def _choose_convention(self, conventions: Sequence[str]) -> None:
+        """Versions of one program differ in the axes of their poses; depth tells."""
+        assert self._poses is not None
+        pairs = posed_pairs(self, self._poses)
+        scores = [agreement(pairs, self.intrinsics, name) for name in conventions] if pairs else [1.0]
+        best = int(np.argmax(scores)) if max(scores) > scores[0] + _CLEARLY else 0
+        name = conventions[best]
+        known = np.isfinite(self._poses).all(axis=(1, 2))
+        self._poses[known] = [CONVENTIONS[name](T) for T in self._poses[known]]
+        by = f"as {scores[best]:.0%} of the depth confirms" if pairs else "which is this format's usual way"
+        self.remarks += (Remark("poses", f"taken as {name}, {by}", is_fine=True),)
 
     @abstractmethod
     def _stored_rgb(self, index: int) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from warpslam.errors import DatasetError
 from warpslam.sequences.calibration import Calibration, find_calibration, has_own_camera
 from warpslam.sequences.image_files import read_depth, read_rgb
+from warpslam.sequences.video import Video
 from warpslam.storage.text_lines import read_numbers
 
 _JSON_FILES = ("intrinsic.json", "camera_intrinsic.json", "camera_intrinsics.json", "intrinsics.json")
@@ -23,7 +24,7 @@ def find_recorded(
     folder: Path,
     camera: str | None,
     default: str | None,
-    rgb_files: Sequence[Path],
+    rgb_files: Sequence[Path] | Video,
     depth_files: Sequence[Path],
     remedy: str = "",
 ) -> Calibration:
@@ -39,7 +40,7 @@ def find_recorded(
     return find_calibration(folder, camera, default, remedy)
 
 
-def recorded(folder: Path, rgb_files: Sequence[Path], depth_files: Sequence[Path]) -> Calibration | None:
+def recorded(folder: Path, rgb_files: Sequence[Path] | Video, depth_files: Sequence[Path]) -> Calibration | None:
     """Camera of the first file of a recorder that the folder holds; None without one."""
     for name in _JSON_FILES:
         if (folder / name).is_file():
@@ -98,12 +99,14 @@ def read_matrix(path: Path) -> np.ndarray:
     raise DatasetError(f"{path}: no camera matrix of 3 or 4 rows; correct it or write a camera.yaml")
 
 
-def image_size(files: Sequence[Path], is_depth: bool = False) -> tuple[int, int]:
-    """Width and height of the first image that can be read.
+def image_size(files: Sequence[Path] | Video, is_depth: bool = False) -> tuple[int, int]:
+    """Width and height of the first image that can be read, or of a video.
 
     Raises:
         DatasetError: None of the first few can.
     """
+    if isinstance(files, Video):
+        return files[0].shape[1], files[0].shape[0]
     error = DatasetError("no images")
     for file in files[:10]:
         try:
