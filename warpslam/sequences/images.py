@@ -213,7 +213,8 @@ class ImageSequence(RgbdSequence):
         if color.distortion:
             rgb = cv2.remap(rgb, *self._undistortion, interpolation=cv2.INTER_LINEAR)
         if color.shares_centre:
-            return color_at_depth(rgb, color.intrinsics, target), depth
+            rgb, seen = color_at_depth(rgb, color.intrinsics, target)
+            return rgb, np.where(seen, depth, np.float32(0))
         depth = register_depth(depth, self.calibration.stored, target, color.transform)
         if (target.width, target.height) != (rgb.shape[1], rgb.shape[0]):
             sx, sy = target.width / rgb.shape[1], target.height / rgb.shape[0]

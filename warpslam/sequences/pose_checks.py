@@ -20,6 +20,7 @@ _MAX_JUMP = 0.5  # [m] of the true pose from frame to frame
 _PAIR_COUNT = 6  # of frames that poses and depth are compared in
 _SURE = 0.85  # agreement of depth and poses beyond which nothing else is tried
 _MEANINGFUL, _CLEARLY = 0.5, 0.15  # agreement of another reading that counts, and by how much it must be better
+_RAYS_SURE = 0.8  # the same for depth along the ray, which changes little
 _NAMED = 3
 
 
@@ -108,7 +109,7 @@ def _other_depth(sequence: ImageSequence, pairs: Pairs, given: float, bad: str) 
     """What would make depth agree with the poses: depth along the ray, or another unit; None if nothing would."""
     camera, calibration = sequence.intrinsics, sequence.calibration
     along = agreement([(on_axis(a, camera), on_axis(b, camera)) for a, b in pairs], camera)
-    if not calibration.along_ray and along > _MEANINGFUL and along > given + _CLEARLY / 3:
+    if not calibration.along_ray and along > _RAYS_SURE and along > given + _CLEARLY / 3:
         message = f"as depth along the axis {given:.0%} agrees with the poses, as depth along the ray {along:.0%}"
         return Finding("depth along the ray", bad, message, along_ray_remedy(sequence))
     # Every scale fits a little where the camera only turns, so another one has to fit clearly better.

@@ -53,15 +53,19 @@ def ray_lengths(camera: Intrinsics) -> np.ndarray:
     return np.linalg.norm(camera.backproject(u, v, 1.0), axis=-1).astype(np.float32)
 
 
-def color_at_depth(rgb: np.ndarray, color: Intrinsics, depth: Intrinsics) -> np.ndarray:
-    """Colour (H, W, 3) in the pixels of a depth camera that shares its centre and axes; black where it sees none."""
+def color_at_depth(rgb: np.ndarray, color: Intrinsics, depth: Intrinsics) -> tuple[np.ndarray, np.ndarray]:
+    """Colour (H, W, 3) in the pixels of a depth camera that shares its centre and axes, and which of them it sees."""
     import cv2
 
     # Pixel (u, v) of depth is pixel s (u - c) + c' of colour, the inverse map that OpenCV asks for.
     su, sv = color.fx / depth.fx, color.fy / depth.fy
     matrix = np.array([[su, 0.0, color.cx - su * depth.cx], [0.0, sv, color.cy - sv * depth.cy]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    return cv2.warpAffine(rgb, matrix, (depth.width, depth.height), flags=flags)
+    size = (depth.width, depth.height)
+    v, u = np.mgrid[: depth.height, : depth.width]
+    column, row = su * u + matrix[0, 2], sv * v + matrix[1, 2]
+    seen = (column > -0.5) & (row > -0.5) & (column < rgb.shape[1] - 0.5) & (row < rgb.shape[0] - 0.5)
+    return cv2.warpAffine(rgb, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE), seen
 
 
 def register_depth(

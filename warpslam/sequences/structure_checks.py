@@ -5,6 +5,7 @@ and whether there is anything to see in every direction.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -35,17 +36,18 @@ def check_registration(frames: Sequence[Frame]) -> Iterator[Finding]:
     """
     few = [frames[i] for i in spread(len(frames), min(len(frames), _FRAMES_KEPT))]
     views = [view for frame in few if (view := _edges(frame)) is not None]
-    if sum(len(u) for u, _, _ in views) < _MIN_EDGES:
+    if sum(len(u) for u, _, _ in views) < _MIN_EDGES or len(views) < 2:
         return
-    here = _contrast(views, 1.0, 0.0, 0.0)
-    candidates = {(s, x, y): _contrast(views, s, x, y) for s, x, y in product(_SCALES, _SHIFTS, _SHIFTS)}
+    points = _EdgePoints.of(views)
+    here = points.mean(1.0, 0.0, 0.0)
+    candidates = {(s, x, y): points.mean(s, x, y) for s, x, y in product(_SCALES, _SHIFTS, _SHIFTS)}
     (scale, x, y), best = max(candidates.items(), key=lambda item: item[1])
     is_near = abs(scale - 1) < _NEAR_SCALE and max(abs(x), abs(y)) < _NEAR_SHIFT
     if is_near or best < _MEANINGFUL or best < _BETTER * here:
         return
     # Chance finds another place for each half of the frames.
-    halves = [_contrast(half, scale, x, y) > _contrast(half, 1.0, 0.0, 0.0) * 1.1 for half in (views[::2], views[1::2])]
-    if not all(halves):
+    halves = (_EdgePoints.of(half) for half in (views[::2], views[1::2]))
+    if any(half.mean(scale, x, y) < _BETTER * half.mean(1.0, 0.0, 0.0) for half in halves):
         return
     width = frames[0].rgb.shape[1]
     text = f"edges of depth do not lie on edges of colour; they would with colour scaled by {1 / scale:.2f}"
@@ -84,6 +86,9 @@ def _edges(frame: Frame) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     grey = cv2.GaussianBlur(cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
     contrast = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
     contrast = np.minimum(contrast, np.percentile(contrast, 95))  # a few bright edges must not decide
+    # Where colour sees nothing, as beside the view of another camera, there is no edge of the scene.
+    unseen = (frame.rgb == 0).all(axis=2).astype(np.uint8)
+    contrast[cv2.dilate(unseen, np.ones((7, 7), np.uint8)) > 0] = 0
     if contrast.mean() <= 0:
         return None
     edge = np.zeros(depth.shape, bool)
@@ -104,18 +109,34 @@ def _edges(frame: Frame) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     return u - (width - 1) / 2, v - (height - 1) / 2, contrast / contrast.mean()
 
 
-def _contrast(views: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], scale: float, x: float, y: float) -> float:
-    """Mean contrast of colour at the edges of depth, if they were scaled and shifted (by shares of the width)."""
-    total, count = 0.0, 0
-    for u, v, contrast in views:
-        height, width = contrast.shape
-        column = np.rint(scale * u + x * width + (width - 1) / 2).astype(int)
-        row = np.rint(scale * v + y * width + (height - 1) / 2).astype(int)
+@dataclass(frozen=True)
+class _EdgePoints:
+    """Edges of depth in several frames, and the contrast of colour there."""
+
+    contrast: np.ndarray
+    """(F, H, W), 1 on average."""
+    frame: np.ndarray
+    """Of each point, int (N,)."""
+    u: np.ndarray
+    """Columns from the middle [px], (N,)."""
+    v: np.ndarray
+    """Rows from the middle [px], (N,)."""
+
+    @classmethod
+    def of(cls, views: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> _EdgePoints:
+        frame = np.concatenate([np.full(len(u), i) for i, (u, _, _) in enumerate(views)])
+        u, v = (np.concatenate([view[k] for view in views]) for k in (0, 1))
+        return cls(np.stack([contrast for _, _, contrast in views]), frame, u, v)
+
+    def mean(self, scale: float, x: float, y: float) -> float:
+        """Mean contrast of colour at the points, if they were scaled and shifted (by shares of the width)."""
+        height, width = self.contrast.shape[1:]
+        column = np.rint(scale * self.u + (x * width + (width - 1) / 2)).astype(np.int32)
+        row = np.rint(scale * self.v + (y * width + (height - 1) / 2)).astype(np.int32)
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        total += float(contrast[row[inside], column[inside]].sum())
+        found = self.contrast[self.frame[inside], row[inside], column[inside]]
         # Edges that leave the image prove nothing, but a transform that throws most out has not won.
-        count += max(int(np.count_nonzero(inside)), len(u) // 2)
-    return total / count if count else 0.0
+        return float(found.sum()) / max(len(found), len(self.u) // 2)
 
 
 def _plane_fits(depth: np.ndarray, rays: np.ndarray) -> Iterator[tuple[float, float]]:
