@@ -25,7 +25,8 @@ class IclNuimSequence(FileSequence):
     preset = "icl"
 
     def __init__(self, folder: Path, camera: str | None = None) -> None:
-        rgb, depth = read_association(next(iter(sorted(folder.glob("associat*.txt")))))
+        lists = sorted(folder.glob("associat*.txt"))
+        rgb, depth = read_association(lists[0] if lists else folder / "associations.txt")
         remarks: list[Remark] = []
         rgb, depth = rgb.present(remarks), depth.present(remarks)
         numbers, of_rgb, of_depth = np.intersect1d(rgb.times, depth.times, return_indices=True)

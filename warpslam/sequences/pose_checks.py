@@ -89,7 +89,7 @@ def _check_convention(sequence: RgbdSequence, fit: PoseFit, poses_matter: bool) 
     scores = {name: agreement(pairs, camera, name) for name in READINGS}
     best = max(scores, key=lambda name: scores[name])
     bad = ERROR if poses_matter else WARNING
-    if scores[best] > _MEANINGFUL and scores[best] > given + _CLEARLY:
+    if _is_clearly_better(scores[best], given):
         message = f"poses are read as {EXPECTED}, which {given:.0%} of the depth agrees with; as {best} it is "
         message += f"{scores[best]:.0%}"
         return Finding("pose convention", bad, message, _remedy(best, fit.path))
@@ -108,20 +108,28 @@ def _check_convention(sequence: RgbdSequence, fit: PoseFit, poses_matter: bool) 
 def _other_depth(sequence: ImageSequence, pairs: Pairs, given: float, bad: str) -> Finding | None:
     """What would make depth agree with the poses: depth along the ray, or another unit; None if nothing would."""
     camera, calibration = sequence.intrinsics, sequence.calibration
-    along = agreement([(on_axis(a, camera), on_axis(b, camera)) for a, b in pairs], camera)
-    if not calibration.along_ray and along > _RAYS_SURE and along > given + _CLEARLY / 3:
-        message = f"as depth along the axis {given:.0%} agrees with the poses, as depth along the ray {along:.0%}"
-        return Finding("depth along the ray", bad, message, along_ray_remedy(sequence))
     # Every scale fits a little where the camera only turns, so another one has to fit clearly better.
     scale = calibration.depth_scale
     others = [known for known in KNOWN_DEPTH_SCALES if known != scale]
     fits = {known: agreement(pairs, camera, depth_factor=scale / known) for known in others}
     better = max(others, key=lambda known: fits[known])
-    if fits[better] > _MEANINGFUL and fits[better] > given + _CLEARLY:
+    along = agreement([(on_axis(a, camera), on_axis(b, camera)) for a, b in pairs], camera)
+    if _is_clearly_better(fits[better], given) and fits[better] > along:
         message = f"with depth_scale {scale:g} {given:.0%} of the depth agrees with the poses, with {better:g} "
         message += f"{fits[better]:.0%}"
         return Finding("depth scale", bad, message, f"type --camera {camera_text(sequence, better)}")
+    if not calibration.along_ray and along > max(_RAYS_SURE, given + _CLEARLY / 3):
+        message = f"as depth along the axis {given:.0%} agrees with the poses, as depth along the ray {along:.0%}"
+        return Finding("depth along the ray", bad, message, along_ray_remedy(sequence))
     return None
+
+
+def _is_clearly_better(other: float, given: float) -> bool:
+    """Whether an agreement is so much better than the one given that it is no chance: by far, or with half as much that
+    disagrees.
+    """
+    halves = other > given + _CLEARLY / 2 and 1 - other < (1 - given) / 2
+    return other > _MEANINGFUL and (other > given + _CLEARLY or halves)
 
 
 def _remedy(reading: str, path: Path | None) -> str:

@@ -36,7 +36,9 @@ class TransformsSequence(FileSequence):
                 (_file(folder, frame["file_path"], IMAGE_SUFFIXES), _depth(folder, frame), frame) for frame in frames
             ]
         except (OSError, ValueError, KeyError, TypeError, RecursionError, AttributeError) as error:
-            raise DatasetError(f"{path}: no list of frames with file_path ({error!r}); correct it") from error
+            raise DatasetError(
+                f"{path}: can't be read as a list of frames with file_path ({error!r}); correct it"
+            ) from error
         usable = [row for row in rows if row[0] is not None and row[1] is not None]
         if not usable:
             raise DatasetError(

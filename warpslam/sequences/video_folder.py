@@ -26,7 +26,7 @@ class VideoFolderSequence(FileSequence):
         if len(videos) != 1:
             names = ", ".join(file.name for file in videos) or "none"
             raise DatasetError(
-                f"{folder}: expected one video ({', '.join(SUFFIXES)}), found {names}; keep that of colour"
+                f"{folder}: no images: expected one video ({', '.join(SUFFIXES)}), found {names}; keep that of colour"
             )
         video = Video(videos[0])
         depth_files = list_images(folder / "depth", suffixes=DEPTH_SUFFIXES)
