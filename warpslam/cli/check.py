@@ -48,6 +48,7 @@ def _check(options: argparse.Namespace) -> int:
         options.dataset,
         options.camera,
         sample_count=count,
+        topics=options.topics,
         max_depth=max_depth,
         read_poses=None if options.poses is None else partial(_given, options.poses),
     )

@@ -34,6 +34,9 @@ def add_sequence_options(parser: argparse.ArgumentParser) -> None:
 def add_format_options(parser: argparse.ArgumentParser) -> None:
     """How to read a folder."""
     parser.add_argument("--dataset", default="auto", help="format of the folder (default: told from its file names)")
+    parser.add_argument(
+        "--topics", metavar="COLOR,DEPTH[,POSES]", help="topics of a bag (default: told from their names)"
+    )
     parser.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
 
 

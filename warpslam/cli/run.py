@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from contextlib import contextmanager
 from dataclasses import replace
@@ -92,10 +93,10 @@ def _run(options: argparse.Namespace) -> int:
             raise ConfigError("--preset, --config and --decoders do not go with --map, which has all three; use --set")
         path = Path(map_).expanduser().resolve()
         map_ = str(RunFolder(path).map if path.is_dir() else path)
-    folder = str(Path(options.folder).expanduser().resolve())
+    folder = os.path.abspath(Path(options.folder).expanduser())  # a link keeps its name, which may tell the camera
     request = replace(
         _common(options),
-        source=Source(folder, options.dataset, options.camera, options.command_line),
+        source=Source(folder, options.dataset, options.camera, options.command_line, options.topics),
         frames=slice_of(options.frames),
         config=config,
         preset=options.preset,

@@ -38,7 +38,7 @@ def open_source(source: Source) -> RgbdSequence:
     """
     if source.is_demo:
         return demo.demo_sequence()
-    return open_sequence(source.path or "", dataset=source.dataset, camera=source.camera)
+    return open_sequence(source.path or "", dataset=source.dataset, camera=source.camera, topics=source.topics)
 
 
 def as_configured(sequence: RgbdSequence, config: Config | None) -> RgbdSequence:

@@ -55,6 +55,7 @@ def check_folder(
     path: str | Path,
     dataset: str = "auto",
     camera: str | None = None,
+    topics: str | None = None,
     *,
     sample_count: int | None = THOROUGH_SAMPLES,
     max_depth: float = MAX_DEPTH,
@@ -66,6 +67,7 @@ def check_folder(
         path: Folder of one sequence.
         dataset: Format, as `warpslam.sequences.open_sequence` takes it.
         camera: Camera, as `open_sequence` takes it.
+        topics: Topics of a bag, as `open_sequence` takes them.
         sample_count: Frames to read, spread over the sequence; None for all.
         max_depth: Depth beyond this does not count [m].
         read_poses: Poses (N, 4, 4) that a run over the sequence would be given, and the file that they are from.
@@ -73,7 +75,7 @@ def check_folder(
     from warpslam.sequences import open_sequence
 
     try:
-        sequence = open_sequence(path, dataset, camera)
+        sequence = open_sequence(path, dataset, camera, topics)
         poses, file = (None, None) if read_poses is None else read_poses(sequence)
     except (DatasetError, MissingDependencyError) as error:
         return CheckReport(str(path), findings=(Finding("sequence", ERROR, str(error)),))

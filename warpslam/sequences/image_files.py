@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from warpslam.errors import DatasetError, MissingDependencyError
+from warpslam.sequences.time_lists import unit_of
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -45,6 +46,20 @@ def list_images(folder: Path, pattern: str = "*", suffixes: tuple[str, ...] = IM
             )
         raise DatasetError(f"{folder}: no images ({wanted}); check that the download is complete and unpacked")
     return sorted(files, key=natural_key)
+
+
+def image_times(files: list[Path]) -> np.ndarray | None:
+    """Times [s] that names of files are, float64 (N,), in whatever unit makes them several a second; None where they
+    are none.
+    """
+    try:
+        times = np.array([float(file.stem) for file in files])
+    except ValueError:
+        return None
+    if len(times) < 2 or not (np.diff(times) > 0).all():
+        return None
+    unit = unit_of(times)
+    return None if unit.name == "frame numbers" else times * unit.seconds
 
 
 def without_strays(files: list[Path]) -> tuple[list[Path], list[Path]]:
