@@ -316,9 +316,11 @@ def check_settings(camera: Intrinsics, config: Config) -> None:
     """
     tracking = config.tracking
     if camera.width <= 2 * tracking.ignore_edge_u or camera.height <= 2 * tracking.ignore_edge_v:
+        fit_u, fit_v = camera.width // 16, camera.height // 12
         raise InputError(
             f"tracking.ignore_edge_u = {tracking.ignore_edge_u} and ignore_edge_v = {tracking.ignore_edge_v} "
-            f"leave nothing of a {camera.width} x {camera.height} image: lower them"
+            f"leave nothing of a {camera.width} x {camera.height} image: lower them, for example with "
+            f"--set tracking.ignore_edge_u={fit_u} tracking.ignore_edge_v={fit_v}"
         )
     if tracking.use_given_poses and config.keyframes.policy == "information_gain":
         raise ConfigError("keyframes.policy = information_gain needs tracking; use interval with given poses")
