@@ -25,8 +25,9 @@ COMMANDS = {
     "check": ("check", "whether a folder of RGB-D frames can be used, before a run"),
     "eval": ("evaluate", "trajectory and reconstruction errors of a run"),
     "report": ("report", "HTML report of a run, or a comparison of several"),
-    "render": ("render", "a frame beside what the map renders at its pose, as PNG"),
+    "render": ("render", "a frame beside what the map renders at its pose, or the mesh along a path as a film"),
     "mesh": ("mesh", "extract the mesh of a run again"),
+    "export": ("export", "the trajectory of a run in the format of another tool"),
     "calibrate-time": (
         "calibrate_time",
         "delay of depth and readout time of a camera, from a recording in which it moves",

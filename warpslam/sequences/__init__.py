@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -161,7 +162,7 @@ def open_sequence(
     if name not in _READERS:
         plugins = _plugins()
         if name in plugins:
-            return plugins[name].load()(path, camera)
+            return _loaded(plugins[name], path)(path, camera)
         known = ", ".join((*DATASETS, *plugins))
         raise DatasetError(f"dataset = {dataset!r} is not a known format; use auto or one of {known}")
     if path.is_file() and name not in _SUFFIXES.values():
@@ -193,6 +194,15 @@ def _plugins() -> dict[str, EntryPoint]:
     from importlib.metadata import entry_points
 
     return {entry.name.lower().replace("-", "_"): entry for entry in entry_points(group=GROUP)}
+
+
+def _loaded(plugin: EntryPoint, path: Path) -> Callable[[Path, str | None], RgbdSequence]:
+    try:
+        return plugin.load()
+    except Exception as error:
+        raise DatasetError(
+            f"{path}: the reader {plugin.name} ({plugin.value}) fails to load ({error}); install what it needs"
+        ) from error
 
 
 def _recognises(plugin: EntryPoint, path: Path) -> bool:

@@ -78,7 +78,7 @@ class BagSequence(ImageSequence):
         frames = self._frame_of(color), self._frame_of(depth)
         transforms = self._transforms()
         calibration = find_calibration(path, camera, None) if camera else self._calibrate(frames, transforms)
-        poses, found = self._poses(names[2] if len(names) > 2 else None, frames[0], transforms, times)
+        poses, found = self._read_poses(names[2] if len(names) > 2 else None, frames[0], transforms, times)
         super().__init__(
             typed_name(path),
             calibration,
@@ -224,7 +224,7 @@ class BagSequence(ImageSequence):
             transforms.add(self._reader.deserialize(data, connection.msgtype), "static" in connection.topic)
         return transforms
 
-    def _poses(
+    def _read_poses(
         self, name: str | None, frame: str, transforms: Transforms, times: np.ndarray
     ) -> tuple[np.ndarray | None, tuple[Remark, ...]]:
         """Poses of the camera (N, 4, 4) from the topic named, else from transforms, else from odometry."""

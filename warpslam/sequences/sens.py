@@ -129,7 +129,7 @@ class SensSequence(ImageSequence):
         return replace(calibration, color=ColorCamera(color.stored))
 
     def _read_frames(self, file: BinaryIO) -> list[_Stored]:
-        frames = []
+        frames: list[_Stored] = []
         for _ in range(self._count):
             head = file.read(_FRAME.size)
             if len(head) < _FRAME.size:  # a download that stopped: the frames that are there can be used
