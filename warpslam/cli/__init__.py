@@ -19,6 +19,7 @@ from warpslam.errors import WarpSlamError
 
 COMMANDS = {
     "run": ("run", "trajectory and coloured mesh of a folder of RGB-D frames"),
+    "live": ("live", "SLAM on a camera that is plugged in; ctrl-C ends it and writes all"),
     "demo": ("run", "SLAM in a small rendered room; needs no data"),
     "batch": ("batch", "run many sequences, and go on where an earlier batch stopped"),
     "bench": ("bench", "the paper's studies on your sequences: tables, plots and a page"),

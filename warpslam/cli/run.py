@@ -36,7 +36,7 @@ from warpslam.runs.request import RunRequest, Source
 from warpslam.synthetic import demo
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from warpslam.runs.record import Progress, RunResult
     from warpslam.runtime.compilation import ModuleProgress
@@ -157,8 +157,14 @@ def _common(options: argparse.Namespace) -> RunRequest:
 
 def _execute(request: RunRequest, options: argparse.Namespace, **keywords: Any) -> int:
     quiet_warp()
-    with warnings_on_stderr(), _display() as display:
-        result = run(request, options.output, observer=display, **keywords)
+    with warnings_on_stderr():
+        return show_run(lambda observer: run(request, options.output, observer=observer, **keywords))
+
+
+def show_run(start: Callable[[Observer], RunResult]) -> int:
+    """Start a run, show how it goes and what came of it; returns the exit code."""
+    with _display() as display:
+        result = start(display)
     _print_summary(result)
     return EXIT_INTERRUPTED if result.status == INTERRUPTED else 0
 

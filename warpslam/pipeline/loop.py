@@ -15,6 +15,7 @@ from warpslam.evaluation import ate
 from warpslam.frames import FrameStatus
 from warpslam.pipeline.results import trajectory_of
 from warpslam.runs.record import Progress
+from warpslam.sequences.base import EndOfFrames
 
 if TYPE_CHECKING:
     from warpslam.frames import FrameResult
@@ -95,6 +96,9 @@ class FrameLoop:
                     raise DatasetError(f"its time {last:.6f} s is not after {before:.6f} s, that of the frame before")
                 if self.given is not None and self.given.of(frame) is None:
                     raise DatasetError(f"{self.given.path} has no pose for {frame.timestamp:.3f} s")
+            except EndOfFrames:
+                record.position -= 1
+                return
             except DatasetError as error:
                 record.leave_out(index, str(error))
                 log.warning("frame %d left out: %s", index, error)
@@ -113,7 +117,8 @@ class FrameLoop:
         record, rmse = self.record, None
         if record.has_truth:
             rmse = ate(trajectory_of(self.slam, record).poses, record.truth).rmse
-        return Progress(len(record.results) + len(record.left_out), len(self.selected), result, rmse, fps)
+        done = len(record.results) + len(record.left_out)
+        return Progress(done, done if self.sequence.is_live else len(self.selected), result, rmse, fps)
 
     def _check_that_one_was_used(self) -> None:
         name, results = self.sequence.name, self.record.results

@@ -218,6 +218,8 @@ class Run:
         log.info("%s: %d of %d frames, %s", self.sequence.name, len(self.selected), len(self.sequence), self.selected)
 
     def _check_input(self) -> None:
+        if self.sequence.is_live:
+            return
         # Poses of a file take the place of the sequence's own, which then matter for the errors alone.
         poses_matter = self.config.tracking.use_given_poses and self.given is None
         if poses_matter and self.sequence.ground_truth() is None and self._first_pose() is None:
@@ -282,8 +284,12 @@ class Run:
             checkpoints=self.checkpoints,
             observer=self.observer,
         )
-        with self.record.clock("frames"):
-            loop.run()
+        try:
+            with self.record.clock("frames"):
+                loop.run()
+        finally:
+            if self.sequence.is_live:
+                self.selected = range(self.record.position)
 
     def _finish_map(self) -> None:
         assert self.slam is not None

@@ -43,6 +43,10 @@ class Remark:
     """Nothing is lost by it; it is only said."""
 
 
+class EndOfFrames(Exception):
+    """A camera that is running has ended; a run that reads it is over, and writes its results."""
+
+
 class RgbdSequence(ABC):
     """A random-access RGB-D sequence.
 
@@ -51,6 +55,7 @@ class RgbdSequence(ABC):
     preset: Name of the settings that suit the sequence (see `warpslam.config.PRESETS`).
     timing: When the pixels of the frames, as returned, are taken.
     remarks: What was noticed in opening it.
+    is_live: Frames come one after another from a camera that is running, and end some time.
     """
 
     name: str
@@ -58,6 +63,7 @@ class RgbdSequence(ABC):
     preset: str = "default"
     timing: SensorTiming = ONE_MOMENT
     remarks: tuple[Remark, ...] = ()
+    is_live: bool = False
 
     @abstractmethod
     def __len__(self) -> int: ...
