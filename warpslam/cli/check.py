@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from warpslam.cli.common import add_command, add_format_options
+from warpslam.cli.common import add_command, add_format_options, add_set_option
 from warpslam.config import Config
 from warpslam.runs.given_poses import GivenPoses
 from warpslam.sequences.base import RgbdSequence
@@ -32,10 +32,7 @@ def add(commands: Any) -> None:
     check.add_argument("folder", metavar="FOLDER", help="folder of one sequence")
     add_format_options(check)
     check.add_argument("--poses", metavar="FILE", help="poses that a run would be given, checked against depth")
-    check.add_argument(
-        "--set", dest="overrides", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
-        help="settings of the run, such as scene_scale=0.1",
-    )  # fmt: skip
+    add_set_option(check)
     check.add_argument("--all", action="store_true", help="read every frame, not a sample of them")
     check.add_argument("--json", action="store_true", help="print JSON")
 
@@ -61,5 +58,6 @@ def _check(options: argparse.Namespace) -> int:
             print(f"{finding.severity:8} {finding.check:16} {finding.message}")
             if finding.remedy:
                 print(f"{'':8} {'':16} -> {finding.remedy}")
-        print(f"{len(report.errors)} errors, {len(report.warnings)} warnings")
+        counts = ((len(report.errors), "error"), (len(report.warnings), "warning"))
+        print(", ".join(f"{count} {name}{'' if count == 1 else 's'}" for count, name in counts))
     return EXIT_FINDINGS if report.errors else 0

@@ -232,7 +232,7 @@ def _compiling(module: ModuleProgress) -> str:
 
 def _figures(progress: Progress) -> str:
     result = progress.result
-    parts = [f"{progress.fps:.2f} fps", *(f"{name} {value:.3g}" for name, value in result.losses.items())]
+    parts = [f"{progress.fps:.2f} fps"]
     if progress.ate_rmse is not None:
         parts.append(f"ATE {100 * progress.ate_rmse:.2f} cm")
     if result.status != FrameStatus.OK:

@@ -5,6 +5,7 @@ Defaults are the published ones for Replica (released code; paper A.6) where not
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -333,8 +334,7 @@ class Config(_Group):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            lines = [f"{'.'.join(map(str, e['loc']))}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
-            raise ConfigError(f"{source}: " + "; ".join(lines)) from None
+            raise ConfigError(f"{source}: " + "; ".join(map(_fault, error.errors()))) from None
 
     @classmethod
     def from_preset(cls, name: str = "default", overrides: Sequence[str] | None = None) -> Config:
@@ -346,7 +346,7 @@ class Config(_Group):
         if name not in PRESETS:
             raise ConfigError(f"preset {name!r} is unknown; choose one of {', '.join(sorted(PRESETS))}")
         values = _merged({}, PRESETS[name], *map(parse_override, overrides or []))
-        return cls.from_dict(values, source=f"preset {name}")
+        return cls.from_dict(values, source="--set" if overrides else f"preset {name}")
 
     @classmethod
     def from_file(cls, path: str | Path, overrides: Sequence[str] | None = None) -> Config:
@@ -447,3 +447,19 @@ def _merged(*parts: dict[str, Any]) -> dict[str, Any]:
     for part in parts:
         merge(values, part)
     return values
+
+
+def _fault(error: Any) -> str:
+    """One fault of settings, in words; a name that is nearly one of ours is corrected."""
+    name = ".".join(map(str, error["loc"]))
+    if error["type"] != "extra_forbidden":
+        return f"{name}: {error['msg']} (got {error['input']!r})"
+    kinds = {field: info.annotation for field, info in Config.model_fields.items()}
+    known = [field for field, kind in kinds.items() if not (isinstance(kind, type) and issubclass(kind, _Group))]
+    for field, kind in kinds.items():
+        if isinstance(kind, type) and issubclass(kind, _Group):
+            known += [f"{field}.{inner}" for inner in kind.model_fields]
+    # A name without its group is as common as a slip of the pen.
+    near = [option for option in known if option.rsplit(".", 1)[-1] == name.rsplit(".", 1)[-1]]
+    near = near or difflib.get_close_matches(name, known, n=1)
+    return f"no setting {name}" + (f"; did you mean {' or '.join(near)}?" if near else "")

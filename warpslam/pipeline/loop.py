@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -27,6 +28,28 @@ if TYPE_CHECKING:
     from warpslam.sequences.base import Frame, RgbdSequence
 
 log = logging.getLogger(__name__)
+_RECENT = 40  # frames, some calls of mapping among them
+
+
+class RecentRate:
+    """Frames a second of the last frames, which tell how long the others will take. The first frame, with the first
+    mapping, is like no other, and counts until there is a second.
+
+    Args:
+        start: Clock before the first frame [s].
+    """
+
+    def __init__(self, start: float) -> None:
+        self._ends = deque([start], maxlen=_RECENT + 1)
+        self._count = 0
+
+    def after_frame(self, now: float) -> float:
+        """The rate [1/s] when the clock shows ``now`` [s] at the end of a frame."""
+        self._count += 1
+        self._ends.append(now)
+        if self._count == 2:
+            self._ends.popleft()
+        return (len(self._ends) - 1) / max(self._ends[-1] - self._ends[0], 1e-9)
 
 
 @dataclass(eq=False)
@@ -63,7 +86,7 @@ class FrameLoop:
         Raises:
             DatasetError: Not a single frame could be used.
         """
-        done_before, start = len(self.record.results), time.perf_counter()
+        rate = RecentRate(time.perf_counter())
         self.checkpoints.before_frames(self.record, self.slam)
         for frame in self._readable_frames():
             truth = _true_pose(frame)
@@ -77,8 +100,7 @@ class FrameLoop:
             self.record.add(frame.index, truth, result)
             level = logging.INFO if result.status == FrameStatus.OK else logging.WARNING
             log.log(level, "frame %d: %s", frame.index, _describe(result))
-            fps = (len(self.record.results) - done_before) / max(time.perf_counter() - start, 1e-9)
-            self.observer.frame(self._progress(result, fps))
+            self.observer.frame(self._progress(result, rate.after_frame(time.perf_counter())))
             self.checkpoints.after_frame(frame, self.record, self.slam)
         self._check_that_one_was_used()
 

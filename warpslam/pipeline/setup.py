@@ -112,7 +112,8 @@ def check_device(device: str | None) -> None:
         ConfigError: It has not.
     """
     names = [str(known) for known in wp.get_devices()]
-    if device is not None and device not in (*names, "cuda"):
+    there = (*names, "cuda") if len(names) > 1 else names
+    if device is not None and device not in there:
         raise ConfigError(f"device {device!r} is not there; this machine has {', '.join(names)}")
 
 
