@@ -115,7 +115,10 @@ def test_settings_of_a_file_with_overrides(tmp_path):
     assert config.tracking == Config().tracking
     config.save(tmp_path / "all.yaml")
     assert Config.from_file(tmp_path / "all.yaml") == config
-    for text, message in (("", "mine.yaml: expected a mapping"), ("mapping: {n: 1}", "mine.yaml: no setting mapping.n")):
+    for text, message in (
+        ("", "mine.yaml: expected a mapping"),
+        ("mapping: {n: 1}", "mine.yaml: no setting mapping.n"),
+    ):
         path.write_text(text)
         with pytest.raises(ConfigError, match=message):
             Config.from_file(path)

@@ -20,6 +20,7 @@ _MAX_JUMP = 0.5  # [m] of the true pose from frame to frame
 _PAIR_COUNT = 6  # of frames that poses and depth are compared in
 _SURE = 0.85  # agreement of depth and poses beyond which nothing else is tried
 _MEANINGFUL, _CLEARLY = 0.5, 0.15  # agreement of another reading that counts, and by how much it must be better
+_MIN_PAIRS = 3  # that must disagree before given poses are refused
 _RAYS_SURE = 0.8  # the same for depth along the ray, which changes little
 _NAMED = 3
 
@@ -102,7 +103,8 @@ def _check_convention(sequence: RgbdSequence, fit: PoseFit, poses_matter: bool) 
     message = f"only {given:.0%} of the depth agrees with the poses, and no other convention fits"
     remedy = "check that poses, camera and frames are of one recording"
     # Poses of a file are about to be believed; wrong ones would smear the map without a word.
-    return Finding("pose convention", bad if fit.path is not None else WARNING, message, remedy)
+    is_sure = fit.path is not None and len(fit.pairs) >= _MIN_PAIRS
+    return Finding("pose convention", bad if is_sure else WARNING, message, remedy)
 
 
 def _other_depth(sequence: ImageSequence, pairs: Pairs, given: float, bad: str) -> Finding | None:
