@@ -30,7 +30,7 @@ def main(count: int = 60, output: str | Path = "runs/live_example", overrides: t
     """Run it; returns the number of frames that could be used in time."""
     result = run_live(RoomCamera(count), output, overrides=overrides)
     print(f"{result.metrics.frames.processed} of {count} frames were used, see {result.folder.path}")
-    return result.metrics.frames.processed
+    return result.metrics.frames.processed or 0
 
 
 if __name__ == "__main__":
