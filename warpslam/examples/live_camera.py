@@ -29,9 +29,8 @@ class RoomCamera(LiveCamera):
 def main(count: int = 60, output: str | Path = "runs/live_example", overrides: tuple[str, ...] = ()) -> int:
     """Run it; returns the number of frames that could be used in time."""
     result = run_live(RoomCamera(count), output, overrides=overrides)
-    used = result.metrics.frames.processed or 0
-    print(f"{used} of {count} frames were used, see {result.folder.path}")
-    return used
+    print(f"{result.metrics.frames.processed} of {count} frames were used, see {result.folder.path}")
+    return result.metrics.frames.processed or 0
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import numpy as np
 from warpslam.errors import DatasetError
 from warpslam.sequences.base import Remark
 
-_MIN_RUN = 5  # frames in a row with the very same pose
+_MIN_RUN = 10  # frames in a row with the very same pose; a pose found by time may serve a few at the end
 _CHANGED = 4.0  # mean difference of grey values between two images of a camera that has moved
 
 
