@@ -14,7 +14,7 @@ from warpslam.runs.folder import RunFolder
 from warpslam.storage.json_files import write_json
 
 
-def fake_run(job, folder: Path, report, watch, slot: int) -> tuple[str, str]:
+def fake_run(job, folder: Path, report, watch, slot: int, **how: object) -> tuple[str, str]:
     """In place of `batch_worker._run`."""
     if "compiling" in job.name:
         time.sleep(0.5)

@@ -12,7 +12,7 @@ from warpslam.runs.folder import RunFolder
 from warpslam.storage.json_files import write_json
 
 
-def fake_run(job: Job, folder: Path, report, watch, slot: int) -> tuple[str, str]:
+def fake_run(job: Job, folder: Path, report, watch, slot: int, **how: object) -> tuple[str, str]:
     """In place of `batch_worker._run`: ATE is 1 cm and 2 cm more a seed; iMAP fails, without colour frames are lost."""
     report({"compiled": True})
     if job.request.method == "imap":

@@ -213,8 +213,8 @@ def test_overlapped_run_goes_on_with_a_weaker_promise(recording, tmp_path, capsy
 
 def test_nothing_to_resume_is_said(uninterrupted, tmp_path, capsys):
     """A run that is over, and a folder without any run."""
-    assert cli.main(["run", "--resume", str(uninterrupted)]) == 2
-    assert "the run is over" in capsys.readouterr().err
+    assert cli.main(["run", "--resume", str(uninterrupted)]) == 0
+    assert "nothing to do" in capsys.readouterr().out
     assert cli.main(["run", "--resume", str(tmp_path)]) == 2
     assert "--checkpoint-every" in capsys.readouterr().err
 
@@ -231,7 +231,7 @@ def test_run_starts_from_a_map(uninterrupted, recording, tmp_path, capsys):
     assert len(after.keyframes) == len(before.keyframes)
     for level, grid in before.scene.grids.items():
         np.testing.assert_array_equal(after.scene.grids[level].features.numpy(), grid.features.numpy())
-    assert cli.main([*command, "--set", "grid.fine_spacing=0.5"]) == 2
+    assert cli.main([*command, "--overwrite", "--set", "grid.fine_spacing=0.5"]) == 2
     assert "grid.fine_spacing = 0.5 does not fit the map" in capsys.readouterr().err
     assert cli.main(["run", str(recording), "--localize"]) == 2
     assert "--map" in capsys.readouterr().err
