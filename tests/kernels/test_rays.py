@@ -99,7 +99,7 @@ def render(batch: RayBatch, scene_map: SceneMap, *thresholds: float):
     """Colour, depth, ray gradient and colour-grid gradient of a mapping loss with some thresholds."""
     arrays = scene_map.arrays()
     rows = scene_map.grids["color"].row_count
-    grid = GridGradient(gradient_buffers(rows, batch.device), wp.full(rows, 1, dtype=wp.uint8, device=batch.device))
+    grid = GridGradient(gradient_buffers(rows, batch.device), wp.array(np.arange(rows), dtype=int, device=batch.device))
     for array in (batch.origin.grad, batch.direction.grad):
         array.zero_()
     with batch.launcher.tape() as tape:

@@ -34,14 +34,14 @@ def look_up(level: grid.Level, points: wp.array[wp.vec3], cells: wp.array[Cell],
 
 @wp.kernel(enable_backward=False, module="attacks")
 def scatter(
-    level: grid.Level, points: wp.array[wp.vec3], selected: wp.array[wp.uint8], grad: wp.array2d[Vec32],
+    level: grid.Level, points: wp.array[wp.vec3], place: wp.array[int], grad: wp.array2d[Vec32],
     back: wp.array[wp.vec3],
 ):  # fmt: skip
     """Both adjoints of a lookup."""
     tid = wp.tid()
     cell = grid.find_cell(level.lattice, points[tid])
     ones = Vec32(1.0)
-    grid.interpolate_adjoint_features(grad, 0, selected, level.lattice, cell, ones)
+    grid.interpolate_adjoint_features(grad, 0, place, level.lattice, cell, ones)
     back[tid] = grid.interpolate_adjoint_point(level, cell, ones)
 
 
@@ -80,14 +80,15 @@ def attempt(rng: np.random.Generator) -> str:
     assert (found["corner"] >= 0).all() and (found["corner"] <= np.array(SHAPE) - 2).all(), "a cell outside the grid"
     assert (found["offset"] >= 0).all() and (found["offset"] <= 1).all(), "a place outside its cell"
     grad = wp.zeros((1, rows), dtype=Vec32, device=CPU)
-    chosen, back = wp.ones(rows, dtype=wp.uint8, device=CPU), wp.zeros(COUNT, dtype=wp.vec3, device=CPU)
-    wp.launch(scatter, COUNT, [level, points, chosen], [grad, back], device=CPU)
+    place, back = wp.array(np.arange(rows), dtype=int, device=CPU), wp.zeros(COUNT, dtype=wp.vec3, device=CPU)
+    wp.launch(scatter, COUNT, [level, points, place], [grad, back], device=CPU)
     assert np.isfinite(grad.numpy()).all(), "a gradient that is not finite"
 
     rays = struct(
         Rays, sample_count=1, origin=vectors(), direction=vectors(), z=wp.zeros(COUNT, dtype=float, device=CPU)
     )
     depth = wp.array(numbers(rng, (COUNT,)).astype(np.float32), dtype=float, device=CPU)
+    chosen = wp.ones(rows, dtype=wp.uint8, device=CPU)
     keep, frame = wp.ones(COUNT, dtype=int, device=CPU), wp.ones(COUNT, dtype=int, device=CPU)
     wp.launch(rejection.drop_unseen, COUNT, [level.lattice, chosen, rays, depth, keep], device=CPU)
     images = struct(

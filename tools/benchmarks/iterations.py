@@ -31,6 +31,7 @@ from tools.benchmarks.torch_slam import Level, TorchSlam
 from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.mapping.frustum import measured_extent
+from warpslam.mapping.mapper import Mapper
 from warpslam.poses import vector_from_pose
 from warpslam.runtime.launching import Launcher
 from warpslam.slam import Slam
@@ -93,10 +94,12 @@ def torch_twin(ours: Ours) -> tuple[TorchSlam, dict[str, np.ndarray], TorchSlam]
         corners = [torch.tensor(corner, dtype=torch.float32) for corner in (low, high)]
         levels[level] = Level(table.permute(3, 0, 1, 2)[None].contiguous(), *corners)
     ours.map_call(1)  # selects the vertices
+    mapper = ours.slam.mapper
+    assert isinstance(mapper, Mapper), "vertices are selected by the rendering loss"
     masks = {}
     for level in levels:
         mask = np.zeros(scene.grids[level].row_count, bool)
-        mask[ours.slam.mapper._grids[level].rows.numpy()] = True
+        mask[mapper._grids[level].rows.numpy()] = True
         masks[level] = mask
     decoders = {weights.level: weights for weights in scene.decoder_weights}
     chosen = (5, 1, 2, 3, 4)

@@ -83,15 +83,15 @@ def test_far_is_a_centimetre_or_half_a_degree():
     assert is_far(np.eye(4), motion_of([0.011, 0, 0, 0, 0, 0]))
 
 
-@pytest.mark.parametrize(("when", "asked"), [("always", 5), ("doubt", 0), ("never", 0)])
+@pytest.mark.parametrize(("when", "asked"), [("always", range(5, 11)), ("doubt", [1]), ("never", [0])])
 def test_features_are_asked_when_the_settings_say(monkeypatch, when, asked):
-    """In a room beyond doubt in all frames but the first, or in none; the camera is found all the same."""
+    """Each time a frame is registered; only where the speed is not known yet; never. It is found all the same."""
     slam, path, calls = tracker(feature_rows=when), [motion_of(n * 0.01 * np.ones(6)) for n in range(6)], []
     rows = SecondWitness.rows
     monkeypatch.setattr(SecondWitness, "rows", lambda self, *a: calls.append(a) or rows(self, *a))
     results = track(slam, path)
     assert errors(results, path)[:, 0].max() < 5e-3
-    assert slam.direct.counts["sure"] == 5 and len(calls) == asked
+    assert slam.direct.counts["sure"] == 4 and len(calls) in asked
 
 
 def test_saved_and_loaded_it_goes_on_alike(tmp_path):

@@ -85,10 +85,6 @@ eleven rendered sequences 98 % of true errors lie within two sigma, 91 % on the 
 """
 MAX_SIGMA = 0.05
 """Standard deviation [m] beyond which a direction is left open, as the normal matrix alone has it."""
-RISING, SECOND_LOOK = 1.25, 0.8
-"""A cost beyond the first multiple of the usual one is worth a second look, which must cost less than the second
-multiple of it.
-"""
 LEAST_COST = 0.5
 """A registration that costs less needs no comparison with others."""
 SEARCH_WIDE, SEARCH_DEEP = 6, 3
@@ -301,11 +297,6 @@ class DirectTracker:
         done: Followed | None = None
         if history.was_known or found is not None:
             done = self._follow(row, self._reference, starts[0], frame, history)
-            if self._foretold is not None and done.attempt.cost > RISING * self._typical_cost:
-                # Thin lines are lost on small images, which may have led away from what was foretold.
-                again = self._follow(row, self._reference, starts[0], frame, history, top=self.judged)
-                if again.attempt.ok and again.attempt.cost < SECOND_LOOK * done.attempt.cost:
-                    done = again
             if self._is_sure(done.attempt):
                 self.counts["sure"] += 1
             else:
@@ -459,17 +450,14 @@ class DirectTracker:
         frame: AdmittedFrame,
         history: FrameHistory,
         best: Attempt | None = None,
-        top: int | None = None,
     ) -> Followed:
         """Register to the reference from a pose, then to all keyframes of large overlap, and look back.
 
-        best: What the pose comes from: only the largest level is left to do. top: Level to begin at, the middle one by
-        default.
+        best: What the pose comes from: only the largest level is left to do.
         """
         W = self.keyframes[reference].pose
-        top = self.plan.middle if top is None else top
         task = self._task()
-        task["keyframe"], task["row"], task["top"], task["low"] = self._points_of(reference), row, top, 0
+        task["keyframe"], task["row"], task["top"], task["low"] = self._points_of(reference), row, self.plan.middle, 0
         task["cost_level"] = 0
         task["T"] = inverse(start) @ W
         if best is not None:
