@@ -280,8 +280,8 @@ class LoopConfig(_Group):
     drift: float = Field(
         0.05,
         ge=0,
-        description="drift that tracking is believed to be capable of, for a metre of way [m]; a loop that "
-        "asks for more is none",
+        description="drift that tracking is believed to be capable of, as a share of the way; a loop that asks for "
+        "more is none",
     )
     drift_floor: float = Field(0.2, ge=0, description="and on no way at all [m]")
     turn_drift: float = Field(0.5, ge=0, description="the same as an angle, for a metre of way [degrees]")
