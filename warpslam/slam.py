@@ -359,7 +359,7 @@ class Slam:
         """A part of the map on its own, beside what there is, which a loop may join later."""
         assert self.direct is not None
         pose, reach = np.eye(4), self.config.grid.max_depth
-        pose[0, 3] = max(keyframe.pose[0, 3] for keyframe in self.keyframes) + 2.0 * reach + PART_GAP
+        pose[0, 3] = max((keyframe.pose[0, 3] for keyframe in self.keyframes), default=0.0) + 2.0 * reach + PART_GAP
         if not self.scene.is_empty:
             pose[0, 3] = self.scene.high[0] + reach + PART_GAP
             try:
