@@ -70,9 +70,9 @@ class Located:
     """Why the pose can't be trusted; empty if it can."""
     after_loss: bool = False
     """Whether the camera was lost before, so that poses before this one say nothing of where it may go."""
-    inliers: float = 1.0
+    inliers: float = np.nan
     """As in `FrameResult`."""
-    depth_error: float = 0.0
+    depth_error: float = np.nan
     """As in `FrameResult` [m]."""
     loss: float | None = None
     """Mean tracking loss per inlier; None for a pose that was given."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from trimesh.proximity import closest_point_naive
 
 from tests.fakes import FakeSequence, FakeSlam, Terminal, wall
 from warpslam import __version__, cli
+from warpslam.cli import progress
 from warpslam.cli.common import parse_frames
 from warpslam.errors import ConfigError, DatasetError
 from warpslam.field.decoders import random_decoders
@@ -345,6 +348,44 @@ def test_progress_bar_on_a_terminal(monkeypatch, faked, tmp_path):
     assert cli.main(["run", "seq", "--frames", "0:6", "-o", str(tmp_path)]) == 0
     text = terminal.getvalue()
     assert "fake sequence" in text and "6/6" in text and "ATE 0." in text and "fps" in text
+
+
+def test_progress_in_80_columns(monkeypatch, faked, tmp_path):
+    """Name, bar, count, figures and the time left stand in one line of 80 columns, also for a long name."""
+    terminal = Terminal()
+    monkeypatch.setattr("sys.stdout", terminal)
+    monkeypatch.setattr(FakeSequence, "name", "a sequence with a name that fills a line by itself")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "80")
+    assert cli.main(["run", "seq", "--frames", "0:6", "-o", str(tmp_path)]) == 0
+    lines = [re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", line) for line in re.split(r"[\r\n]", terminal.getvalue())]
+    whole = [line for line in lines if "6/6" in line and line.startswith("a sequence wi")]
+    assert whole and all(len(line) <= 80 for line in whole)
+    assert any("fps" in line and "ATE 0." in line and line.rstrip().endswith("left") for line in whole)
+    assert any("writing the report" in line for line in whole)
+
+
+def test_stages_after_the_last_frame(faked, tmp_path, capsys):
+    """Where there is no terminal each of them is a line, in their order, after the last frame."""
+    assert cli.main(["run", "seq", "--frames", "0:6", "-o", str(tmp_path / "out")]) == 0
+    out = capsys.readouterr().out
+    stages = ["frame 6/6", "refining the map", "saving", "extracting the mesh", "rendering pictures", "writing the rep"]
+    places = [out.index(stage) for stage in stages]
+    assert places == sorted(places)
+
+
+def test_long_work_is_shown(capsys, monkeypatch):
+    """What takes its time says so, with how far it is and how long it will take; what does not, says nothing."""
+    monkeypatch.setattr(progress, "_QUIET_SECONDS", 0.05)
+    with progress.working("rendering") as advance:
+        time.sleep(0.3)
+        advance(1, 4)
+    with progress.working("reading") as advance:
+        advance(1, 4)
+    shown = capsys.readouterr().err
+    assert (
+        "rendering ..." in shown and re.search(r"rendering 1/4, [\d.]+ (s|ms) left", shown) and "reading" not in shown
+    )
 
 
 def test_set_does_not_swallow_the_folder(capsys):

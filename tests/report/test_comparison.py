@@ -27,7 +27,7 @@ def test_comparison_of_runs(make_run, tmp_path):
     text = write_comparison(tmp_path / "all.html", [good, bad, blind]).read_text(encoding="utf-8")
     page = Page(text)
     assert page.problems == [] and list(page.sections) == ["table", "bars", "meshes", "runs"]
-    assert page.external == ["good/report.html", "bad/report.html", "blind/report.html"]
+    assert page.links == ["good/report.html", "bad/report.html", "blind/report.html"] and page.external == []
     best = 100 * read_json(good.metrics)["ate_m"]["aligned"]["rmse"]
     assert f"<strong>{best:.2f} cm</strong>" in text and "<strong>50.00 cm</strong>" not in text
     assert "50.00 cm" in page.sections["bars"] and "–" in page.sections["table"]

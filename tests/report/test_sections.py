@@ -18,7 +18,7 @@ from warpslam.storage.json_files import read_json, write_json
 
 SECTIONS = (
     "figures", "trajectory", "error", "images", "mesh", "keyframes", "timing", "memory", "frames", "settings",
-    "versions",
+    "versions", "files",
 )  # fmt: skip
 
 

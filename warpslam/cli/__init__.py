@@ -31,6 +31,7 @@ COMMANDS = {
     ),
     "eval": ("evaluate", "trajectory and reconstruction errors of a run"),
     "report": ("report", "HTML report of a run, or a comparison of several"),
+    "view": ("view", "a finished run in the browser: its mesh, path and images over time"),
     "render": ("render", "a frame beside what the map renders at its pose, or the mesh along a path as a film"),
     "mesh": ("mesh", "extract the mesh of a run again"),
     "export": ("export", "the trajectory of a run in the format of another tool"),

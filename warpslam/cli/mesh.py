@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from warpslam.cli.common import add_command, add_device_option, quiet_warp
+from warpslam.cli.progress import working
 
 _DEFAULT_ROUNDS = 5
 
@@ -34,16 +35,17 @@ def _mesh(options: argparse.Namespace) -> int:
     from warpslam.runs.folder import RunFolder
 
     quiet_warp()
-    mesh, path = extract_mesh(
-        RunFolder.open(options.run),
-        options.voxel,
-        options.output,
-        options.device,
-        forecast=options.forecast,
-        refinement_rounds=options.refine,
-        faces=options.faces,
-        points_only=options.points,
-    )
+    with working("extracting the mesh"):
+        mesh, path = extract_mesh(
+            RunFolder.open(options.run),
+            options.voxel,
+            options.output,
+            options.device,
+            forecast=options.forecast,
+            refinement_rounds=options.refine,
+            faces=options.faces,
+            points_only=options.points,
+        )
     extra = (
         f", {mesh.metadata['forecast_faces']} of them forecast" if options.forecast and options.faces is None else ""
     )
