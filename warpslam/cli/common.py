@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from warpslam.cli.examples import epilog
 from warpslam.cli.exit_codes import EXIT_INTERRUPTED as EXIT_INTERRUPTED
 from warpslam.config import Config
 from warpslam.errors import ConfigError
@@ -20,8 +21,9 @@ from warpslam.runs.request import ALL_FRAMES, Slice, parse_slice
 
 def add_command(commands: Any, name: str, function: Callable[[argparse.Namespace], int], text: str) -> Any:
     """Add a command that ``function`` carries out; it returns the exit code."""
-    parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-    parser.set_defaults(command=function)
+    description = text[0].upper() + text[1:] + "."
+    parser = commands.add_parser(name, help=text, description=description, epilog=epilog(name))
+    parser.set_defaults(command=function, parser=parser)
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return parser
 
