@@ -62,6 +62,7 @@ def add_view_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", action="store_true", help="look on in the browser (pip install viser)")
     add_view_address(parser, "--view-at")
     parser.add_argument("--record", metavar="FILE.rrd", help="record it for Rerun (pip install rerun-sdk)")
+    parser.add_argument("--log", metavar="WHERE", help="figures to tensorboard:FOLDER or wandb:PROJECT")
 
 
 def viewers(options: argparse.Namespace) -> list[Observer]:
@@ -77,6 +78,10 @@ def viewers(options: argparse.Namespace) -> list[Observer]:
         from warpslam.viewer.recording import RerunRecording
 
         found.append(RerunRecording(options.record))
+    if options.log:
+        from warpslam.viewer.figures import FigureLog
+
+        found.append(FigureLog(options.log))
     return found
 
 

@@ -35,7 +35,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     ),
     "mesh": (
         "warpslam mesh runs/kitchen/latest --voxel 0.01 -o fine.glb",
-        "warpslam mesh runs/kitchen/latest --faces 50000 -o small.obj",
+        "warpslam mesh runs/kitchen/latest --faces 50000 --texture -o small.glb",
     ),
     "export": (
         "warpslam export runs/kitchen/latest euroc -o poses.csv",
