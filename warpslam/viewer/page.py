@@ -179,7 +179,7 @@ class Page:
 
     def show_input(self, rgb: np.ndarray) -> None:
         """Show what the camera sees, uint8 (H, W, 3)."""
-        self._input.image = _small(rgb)
+        self._input.image = _small(rgb, enlarge=True)
 
     def show_rendering(self, rgb: np.ndarray) -> None:
         """Show what the map renders, uint8 (H, W, 3), scaled up to the input's size."""
