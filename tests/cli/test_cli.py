@@ -114,7 +114,8 @@ def test_report_of_one_run_and_of_several(faked, tmp_path, monkeypatch, capsys):
         assert cli.main(["report", *arguments]) == 0
     assert capsys.readouterr().out.split() == ["a/report.html", "other.html", "comparison.html"]
     assert "<h1>2 runs</h1>" in (tmp_path / "comparison.html").read_text()
-    assert (tmp_path / "a/report.html").read_text() == (tmp_path / "other.html").read_text()
+    beside, elsewhere = (tmp_path / name for name in ("a/report.html", "other.html"))
+    assert re.sub('href="a/', 'href="', elsewhere.read_text()) == beside.read_text()
     assert cli.main(["report", "a", "nowhere"]) == 2
 
 
@@ -185,7 +186,7 @@ def test_wrong_arguments_exit_2(arguments, capsys):
     with pytest.raises(SystemExit) as exit_:
         cli.main(arguments)
     assert exit_.value.code == 2
-    assert "usage:" in capsys.readouterr().err
+    assert ("there is no command" if arguments == ["fly"] else "usage:") in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -273,7 +274,7 @@ def test_info_names_versions_devices_and_decoders(capsys, tmp_path):
     random_decoders().save(tmp_path / "d.pth")
     assert cli.main(["info", "--decoders", str(tmp_path / "d.pth")]) == 0
     out = capsys.readouterr().out
-    words = ["warpslam", "warp-lang", "torch", "cpu", "d.pth", "'coarse': 32", "replica", "tum_rgbd"]
+    words = ["warpslam", "warp-lang", "torch", "cpu", "d.pth", "hidden width 32", "replica", "tum_rgbd"]
     words += ["40,961", "443,908"]
     for word in words:
         assert word in out, word

@@ -18,7 +18,8 @@ from warpslam.report import write_comparison, write_report
 from warpslam.report.turntable import MAX_FACES, lightened
 
 SWITCHES = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--headless", "--no-sandbox", "--disable-gpu", "--disable-3d-apis", "--disable-quic",
+    "--no-first-run", "--disable-sync",
     "--disable-background-networking", "--disable-component-update", "--hide-scrollbars",
     # Whatever a page asked for beyond its own file would fail, and say so on the console.
     "--host-resolver-rules=MAP * ~NOTFOUND", "--enable-logging=stderr", "--v=0",
@@ -105,7 +106,8 @@ def test_the_mesh_can_be_turned(make_run, tmp_path):
         first = canvas()
         left = (x + 100, y + height // 2)
         page.drag(left, (left[0] + round(np.pi * height / 3), left[1]))
-        turned = wait_for(lambda: canvas() if np.abs(canvas() - first).max(axis=2).mean() > 3 else None, 30)
+        wait_for(lambda: np.abs(canvas() - first).max(axis=2).mean() > 3, 30)
+        turned = canvas()
         (red, blue), (red_then, blue_then) = red_and_blue(turned), red_and_blue(first)
         assert np.sign(red - blue) == -np.sign(red_then - blue_then), "half a turn shows the other side"
         cut = "document.getElementById('turntable-cut')"

@@ -101,12 +101,18 @@ class RunBar(Observer):
     def frame(self, progress: Progress) -> None:
         """See `Observer`."""
         end = time.monotonic() + progress.seconds_left
-        self._bar.update(self._task, total=progress.total, completed=progress.done, figures=_figures(progress), end=end)
+        self._show(total=progress.total, completed=progress.done, figures=_figures(progress), end=end)
+        if progress.done == progress.total:
+            self._bar.refresh()  # before the stages that follow take its place
 
     def stage(self, name: str) -> None:
         """See `Observer`."""
         if self._task is not None:
-            self._bar.update(self._task, figures=name)
+            self._show(figures=name)
+            self._bar.refresh()
+
+    def _show(self, **fields: Any) -> None:
+        self._bar.update(self._task, **fields)
 
 
 def _figures(progress: Progress) -> str:

@@ -79,7 +79,7 @@ def _sequence(options: argparse.Namespace) -> int:
         sequence = altered(made, options.alterations)
         write_sequence(sequence, options.output)
     print(f"wrote {len(sequence)} frames; run them with")
-    print(f"  warpslam run {options.output} --preset default --truth-mesh {options.output}/mesh.ply")
+    print(f"  warpslam run {options.output} --preset default --gt-mesh {options.output}/mesh.ply")
     return 0
 
 

@@ -81,7 +81,8 @@ class Page:
 
     def _build(self, title: str) -> None:
         server, camera = self._server, self._camera
-        server.gui.configure_theme(control_layout="fixed", show_logo=False, show_share_button=False, dark_mode=True)
+        server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
+        server.gui.main_panel.dock_right()
         server.scene.set_background_image(np.full((2, 2, 3), 24, np.uint8), format="png")
         angle = 2 * float(np.arctan(camera.height / (2 * camera.fy)))
         self._frustum = server.scene.add_camera_frustum(
