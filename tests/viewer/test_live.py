@@ -14,8 +14,10 @@ from warpslam.camera import Intrinsics
 from warpslam.cli import main
 from warpslam.config import Config
 from warpslam.errors import ConfigError, MissingDependencyError
+from warpslam.frames import FrameResult
 from warpslam.pipeline import run as pipeline
 from warpslam.pipeline.observer import Observer, Observers
+from warpslam.runs.record import Progress
 from warpslam.synthetic import SyntheticSequence
 from warpslam.viewer import live
 from warpslam.viewer.live import SHARE, Budget, LiveView
@@ -52,6 +54,44 @@ def test_what_is_spent_is_a_share_of_what_passes():
             assert budget.spend(work) == pytest.approx(piece)
     assert budget.spent == pytest.approx(piece * done)
     assert 0.9 * SHARE * clock.now < budget.spent <= SHARE * clock.now
+
+
+@pytest.mark.parametrize("frame_seconds", [0.005, 0.04, 1.0])
+def test_engine_keeps_its_time(monkeypatch, frame_seconds):
+    """A watched run of ten minutes: what the page, the rendering and the blocks take is below a twentieth of it, and
+    the camera is shown at least every other second.
+    """
+    clock, shown, spent = Clock(), [], []
+
+    def costing(seconds, note=None):
+        def work(*_):
+            clock.now += seconds
+            spent.append(seconds)
+            if note is not None:
+                note.append(clock.now)
+
+        return work
+
+    class Page:
+        is_watched = True
+
+    class Stopwatch:
+        perf_counter = staticmethod(clock)
+
+    monkeypatch.setattr(live, "time", Stopwatch)
+    monkeypatch.setattr(live.Budget.__init__, "__defaults__", (SHARE, clock))
+    view = LiveView(ANYWHERE)
+    view.page = Page()
+    view._show_camera = costing(0.02, shown)
+    view._show_rendering = costing(0.4)
+    view._show_blocks = costing(0.15)
+    view._positions = [np.zeros(3)]
+    frames = int(600 / frame_seconds)
+    for number in range(frames):
+        clock.now += frame_seconds
+        view.frame(Progress(number + 1, frames + 1, FrameResult(number, 0.0, np.eye(4)), None, 1.0))
+    assert 0.02 * clock.now < sum(spent) < 0.05 * clock.now
+    assert max(np.diff(shown)) < 2.0 + frame_seconds + 0.6
 
 
 def test_addresses():
@@ -109,7 +149,8 @@ def test_a_page_that_is_watched(monkeypatch, tmp_path):
         """Lets the browser look at single frames."""
 
         def frame(self, progress) -> None:
-            view.budget.spent = -1e9  # what is shown is tested here, not what it costs
+            for budget in view.budgets:
+                budget.spent = -1e9  # what is shown is tested here, not what it costs
             if progress.done == 1:
                 browser.open(view.page.url)
                 wait_for(lambda: view.page.is_watched, 60)

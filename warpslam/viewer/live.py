@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SHARE = 0.04
-"""Part of the engine's time that showing may take."""
-_MIN_INTERVAL = 0.1  # [s] between two states of the camera
+"""Part of the engine's time that showing may take: half of it the camera and its images, half of it the map."""
+_MIN_INTERVAL, _MAX_INTERVAL = 0.1, 2.0  # [s] between two states of the camera
 _RENDERED_WIDTH = 64  # [px]
 _RENDER_INTERVAL = 2.0  # [s], at least
 _BLOCK_SECONDS = 0.05  # a helping of meshing
@@ -64,7 +64,7 @@ class Budget:
 class LiveView(Observer):
     """Shows a run in the browser: camera, path, keyframes, images, and the mesh block by block.
 
-    The camera, which costs a millisecond, comes first; what the map renders and blocks of the mesh follow as the budget
+    The camera is shown up to ten times a second; what the map renders, and blocks of the mesh, come as their budget
     allows, and only while a page is open. Nothing of it changes the run.
 
     Args:
@@ -76,7 +76,7 @@ class LiveView(Observer):
         self._address, self._announce = address, announce
         self._name = ""
         self.page: Page | None = None
-        self.budget = Budget()
+        self.budgets = Budget(SHARE / 2), Budget(SHARE / 2)
         self._mesh: GrowingMesh | None = None
         self._method: Any = None
         self._shown_at = self._rendered_at = -np.inf
@@ -99,23 +99,25 @@ class LiveView(Observer):
                 _COARSER * meshing.voxel, meshing.level_set, block_cells=_BLOCKS, device=str(method.device)
             )
         self._stride = max(1, sequence.intrinsics.width // _RENDERED_WIDTH)
-        self.budget = Budget()
+        self.budgets = Budget(SHARE / 2), Budget(SHARE / 2)
 
     def frame(self, progress: Progress) -> None:
         """Show what the budget allows."""
         now = time.perf_counter()
-        is_last = progress.done == progress.total
-        if now - self._shown_at >= _MIN_INTERVAL or is_last or not self._positions:
+        camera, map_ = self.budgets
+        since = now - self._shown_at
+        is_wanted = progress.done == progress.total or not self._positions
+        if is_wanted or since >= _MAX_INTERVAL or (since >= _MIN_INTERVAL and camera.left >= 0):
             self._shown_at = now
-            self.budget.spend(lambda: self._show_camera(progress))
+            camera.spend(lambda: self._show_camera(progress))
         assert self.page is not None
         if not self.page.is_watched:
             return
-        if now - self._rendered_at >= _RENDER_INTERVAL and self.budget.left >= self._render_cost:
+        if now - self._rendered_at >= _RENDER_INTERVAL and map_.left >= self._render_cost:
             self._rendered_at = now
-            self._render_cost = self.budget.spend(lambda: self._show_rendering(progress))
-        if self.budget.left >= self._mesh_cost:
-            self._mesh_cost = self.budget.spend(lambda: self._show_blocks(_BLOCK_SECONDS))
+            self._render_cost = map_.spend(lambda: self._show_rendering(progress))
+        if map_.left >= self._mesh_cost:
+            self._mesh_cost = map_.spend(lambda: self._show_blocks(_BLOCK_SECONDS))
 
     def done(self, result: RunResult) -> None:
         """Show the mesh in full."""

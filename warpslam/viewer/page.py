@@ -76,7 +76,7 @@ class Page:
         self._pose = np.eye(4)
         self._up = np.array([0.0, -1.0, 0.0])
         self._has_eye = False
-        self._keyframe_count = 0
+        self._keyframes = np.zeros((0, 4, 4))
         self._build(title)
 
     def _build(self, title: str) -> None:
@@ -165,18 +165,20 @@ class Page:
             self._server.scene.remove_by_name(f"/path/{number}")
 
     def show_keyframes(self, poses: np.ndarray) -> None:
-        """Draw keyframes at poses (K, 4, 4)."""
+        """Draw keyframes at poses (K, 4, 4); those that are new or have moved are sent."""
         camera = self._camera
         angle = 2 * float(np.arctan(camera.height / (2 * camera.fy)))
-        for number, pose in enumerate(poses):
+        before, self._keyframes = self._keyframes, np.array(poses).reshape(-1, 4, 4)
+        for number, pose in enumerate(self._keyframes):
+            if number < len(before) and np.allclose(before[number], pose, atol=1e-3):
+                continue
             vector = vector_from_pose(pose)
             self._server.scene.add_camera_frustum(
                 f"/keyframes/{number}", angle, camera.width / camera.height, scale=0.08, thickness=1.0,
                 thickness_units="screen", color=KEYFRAME_COLOR, wxyz=vector[:4], position=vector[4:],
             )  # fmt: skip
-        for number in range(len(poses), self._keyframe_count):
+        for number in range(len(poses), len(before)):
             self._server.scene.remove_by_name(f"/keyframes/{number}")
-        self._keyframe_count = len(poses)
 
     def show_input(self, rgb: np.ndarray) -> None:
         """Show what the camera sees, uint8 (H, W, 3)."""
