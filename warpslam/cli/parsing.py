@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any, NoReturn
 
 
@@ -15,11 +15,11 @@ class Parser(argparse.ArgumentParser):
         keywords.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(*arguments, **keywords)
 
-    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:
+    def parse_args(self, args: Iterable[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """Options of the command that is asked for; words that are too many are told with its usage, not with this
         parser's.
         """
-        options, left = self.parse_known_args(args, namespace)
+        options, left = self.parse_known_args(None if args is None else list(args), namespace)
         if left:
             parser = getattr(options, "parser", self)
             parser.error(f"unrecognized arguments: {' '.join(left)}{_hint(left[0], parser)}")

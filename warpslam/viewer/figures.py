@@ -41,7 +41,8 @@ class FigureLog(Observer):
         kind, _, place = target.partition(":")
         if kind not in TARGETS or not place:
             raise ConfigError(f"--log {target}: give tensorboard:FOLDER or wandb:PROJECT")
-        self._open = {"tensorboard": _TensorBoard, "wandb": _WeightsAndBiases}[kind]
+        sinks: dict[str, Any] = {"tensorboard": _TensorBoard, "wandb": _WeightsAndBiases}
+        self._open = sinks[kind]
         self._place = place
         self._open.require()
         self._sink: Sink | None = None
