@@ -164,12 +164,13 @@ def test_interrupted_run_exits_130_with_partial_results(faked, tmp_path, monkeyp
     ],
 )
 def test_errors_are_one_line_and_exit_2(arguments, message, tmp_path, capsys):
-    """What the user can put right is one clear line on stderr, without a traceback."""
+    """What the user can put right is one clear line on stderr, without a traceback; only what goes on may be said before
+    it, where the machine is slow.
+    """
     extra = ["-o", str(tmp_path)] if arguments[0] == "demo" else []
     assert cli.main([*arguments, *extra]) == 2
-    err = capsys.readouterr().err
-    assert err.startswith("warpslam: ") and message in err
-    assert "Traceback" not in err and len(err.strip().splitlines()) == 1
+    lines = [line for line in capsys.readouterr().err.strip().splitlines() if not line.endswith(" ...")]
+    assert len(lines) == 1 and lines[0].startswith("warpslam: ") and message in lines[0]
 
 
 def test_debug_shows_the_traceback():
