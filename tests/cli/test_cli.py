@@ -164,8 +164,8 @@ def test_interrupted_run_exits_130_with_partial_results(faked, tmp_path, monkeyp
     ],
 )
 def test_errors_are_one_line_and_exit_2(arguments, message, tmp_path, capsys):
-    """What the user can put right is one clear line on stderr, without a traceback; only what goes on may be said before
-    it, where the machine is slow.
+    """What the user can put right is one clear line on stderr, without a traceback; only what goes on may be said
+    before it, where the machine is slow.
     """
     extra = ["-o", str(tmp_path)] if arguments[0] == "demo" else []
     assert cli.main([*arguments, *extra]) == 2
