@@ -21,6 +21,7 @@ _PLAIN_LINES = 20
 _QUIET_SECONDS = 2.0  # what takes no longer says nothing
 _BAR_WIDTH = 10
 _NAME_WIDTH = 14  # with bar, counts, figures and the time left it fits into 80 columns
+_REFRESH = 0.2  # [s], at least between two that are asked for
 _UPDATES = 10  # lines of a long piece of work, where there is no terminal
 
 Advance = Callable[[int, int], None]
@@ -71,8 +72,8 @@ class Lines(Observer):
         """See `Observer`."""
         every = max(1, progress.total // _PLAIN_LINES)
         if progress.done % every == 0 or progress.done in (1, progress.total):
-            left = duration(progress.seconds_left)
-            print(f"frame {progress.done}/{progress.total}  {_figures(progress)}  {left} left", flush=True)
+            left = f"  {duration(progress.seconds_left)} left" if progress.seconds_left else ""
+            print(f"frame {progress.done}/{progress.total}  {_figures(progress)}{left}", flush=True)
 
     def stage(self, name: str) -> None:
         """See `Observer`."""
@@ -85,6 +86,7 @@ class RunBar(Observer):
     def __init__(self, bar: Any) -> None:
         self._bar = bar
         self._task: Any = None
+        self._refreshed = 0.0
 
     def begin(self, name: str) -> None:
         """See `Observer`."""
@@ -100,9 +102,11 @@ class RunBar(Observer):
 
     def frame(self, progress: Progress) -> None:
         """See `Observer`."""
-        end = time.monotonic() + progress.seconds_left
+        now = time.monotonic()
+        end = now + progress.seconds_left if progress.seconds_left else None
         self._show(total=progress.total, completed=progress.done, figures=_figures(progress), end=end)
-        if progress.done == progress.total:
+        if progress.done == progress.total and now - self._refreshed > _REFRESH:
+            self._refreshed = now
             self._bar.refresh()  # before the stages that follow take its place
 
     def stage(self, name: str) -> None:

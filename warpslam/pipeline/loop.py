@@ -133,7 +133,9 @@ class FrameLoop:
             self._ate = ate(trajectory_of(self.slam, record).poses, record.truth).rmse if record.has_truth else None
         done = processed + len(record.left_out)
         seconds_left = self.forecast.after_frame(result, done)
-        total = done if self.sequence.is_live else len(self.selected)
+        total = len(self.selected)
+        if self.sequence.is_live:  # until somebody ends it
+            total, seconds_left = done, 0.0
         return Progress(done, total, result, self._ate, self.forecast.fps, seconds_left, frame)
 
     def _check_that_one_was_used(self) -> None:
