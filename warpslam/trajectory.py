@@ -170,7 +170,8 @@ class FrameHistory:
         # Over a gap that was bridged the speed before it is believed.
         if self._poses and (self._status[-1] is FrameStatus.OK or located.after_loss):
             self._motion = np.linalg.inv(self.last_pose) @ located.T_world_camera
-        self._append(timestamp, located.T_world_camera, FrameStatus.OK, located.depth_error)
+        measured = 0.0 if np.isnan(located.depth_error) else located.depth_error  # 0: of no use as a limit
+        self._append(timestamp, located.T_world_camera, FrameStatus.OK, measured)
 
     def skip(self, timestamp: float) -> None:
         """The next frame, in which there is nothing usable."""
