@@ -18,7 +18,7 @@ from warpslam.storage.json_files import read_json, write_json
 
 SECTIONS = (
     "figures", "trajectory", "error", "images", "mesh", "keyframes", "timing", "memory", "frames", "settings",
-    "versions",
+    "versions", "files",
 )  # fmt: skip
 
 
@@ -138,7 +138,7 @@ def test_names_from_outside_are_escaped(make_run):
     folder.config.write_text(evil)
     page = report_of(folder)
     assert page.text.count(evil) >= 6
-    data = json.loads(page.scripts[0])
+    data = json.loads(page.scripts[-2])
     assert evil in data["text"][3] and len(data["text"]) == len(data["path"]) == len(data["time"]) == 8
 
 
