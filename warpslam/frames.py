@@ -66,7 +66,7 @@ class FrameResult:
     """Of the pose, float64 (6, 6): T_world_camera is uncertain by exp(xi) on its right, xi = (v, w) [m, rad],
     against the keyframe."""
     timings: dict[str, float] = field(default_factory=dict)
-    """Seconds by phase: "tracking", "mapping" (overlapped: waiting for it and taking it over), "keyframe"."""
+    """Seconds by phase: "tracking", "loops", "mapping" (overlapped: waiting for it and taking it over), "keyframe"."""
     message: str = ""
     """Why the frame is not OK."""
     reference: int | None = None

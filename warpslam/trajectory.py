@@ -227,6 +227,12 @@ class FrameHistory:
         return next(self._known(), None)
 
     @property
+    def lost_since_break(self) -> int:
+        """Frames that were lost since the camera may be anywhere, if none was OK; 0 otherwise."""
+        status = self._status[self._first :]
+        return 0 if FrameStatus.OK in status else status.count(FrameStatus.LOST)
+
+    @property
     def was_known(self) -> bool:
         """Whether the pose of the very last frame is known."""
         return self.last_known is not None and self.last_known == len(self) - 1

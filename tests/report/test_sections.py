@@ -58,6 +58,19 @@ def test_figures_of_a_whole_run(make_run):
     assert 'class="missing"' not in folder.report.read_text()
 
 
+def test_loops_are_drawn_and_counted(make_run):
+    """A line between the two keyframes of a loop, and what became of all candidates."""
+    folder = make_run()
+    assert "Loops:" not in report_of(folder).sections["keyframes"]
+    figures = {"candidates": 7, "geometry": 3, "registration": 2, "depth": 1, "unique": 1, "plausible": 1, "solved": 1}
+    loops = {**figures, "edges": [[0, 4]], "moved_keyframes": 3, "largest_move_m": 0.042, "seconds": 1.5}
+    write_json(folder.metrics, read_json(folder.metrics) | {"loops": loops})
+    shown = report_of(folder).sections["keyframes"]
+    assert "loop: frames 0 and 4 show one place" in shown
+    assert "7 pairs of keyframes compared; 3 passed geometry" in shown and "1 loops hold" in shown
+    assert "3 keyframes moved, by up to 4.2 cm; 1.5 s" in shown
+
+
 def test_without_ground_truth(make_run):
     """No truth is said plainly; the path and the losses are still drawn."""
     page = report_of(make_run(sequence=FakeSequence(6, no_truth=tuple(range(6)))))

@@ -209,6 +209,8 @@ def _print_summary(result: RunResult) -> None:
         print(f"ATE RMSE    {100 * result.ate.rmse:.2f} cm aligned, {100 * (unaligned or 0):.2f} cm unaligned")
     if metrics.has("found_timing"):
         print(f"timing      {metrics.found_timing.text}; for camera.yaml")
+    if metrics.has("loops"):
+        print(f"loops       {metrics.loops.text}")
     size, mesh = metrics.map, metrics.mesh
     if size.bytes is not None:
         cost = f", {size.flops_per_point:,} FLOP a point" if size.flops_per_point is not None else ""

@@ -365,6 +365,12 @@ def keyframes_section(run: RunData) -> Html:
         (a, b, share, f"frames {numbers[frames[a]]} and {numbers[frames[b]]}: {percent(share)} in common")
         for a, b, share in pairs
     ]
+    number_of = {frame: n for n, frame in enumerate(frames)}
+    loops = [pair for pair in run.metrics.loops.edges if all(frame in number_of for frame in pair)]
+    links += [
+        (number_of[a], number_of[b], 1.0, f"loop: frames {numbers[a]} and {numbers[b]} show one place")
+        for a, b in loops
+    ]
     chart, _ = charts.ground_chart(
         "Keyframes from above", [("faint", "camera path", ground)],
         axis_names=(axis_name(axes[0]), axis_name(axes[1])), points=points, links=links,
@@ -373,7 +379,10 @@ def keyframes_section(run: RunData) -> Html:
         f"{len(frames)} keyframes; {len(pairs)} pairs see at least {100 * SHOWN_OVERLAP:.0f} % of the same space. "
         "The stronger a line, the more they share."
     )
-    return section("keyframes", title, element("figure", chart, element("figcaption", caption)))
+    content: list[Html] = [element("figure", chart, element("figcaption", caption))]
+    if run.metrics.has("loops"):
+        content.append(element("p", f"Loops: {run.metrics.loops.text}."))
+    return section("keyframes", title, content)
 
 
 def _cursor_data(run: RunData, pixels: np.ndarray | None) -> str:
