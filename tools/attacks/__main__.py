@@ -69,7 +69,7 @@ KINDS: dict[str, tuple[Callable[[str, int, int], Account], int, int]] = {
     "checkpoints": (_module("files", 4.0), 1000, 10),
     "decoders": (_module("files", 4.0), 1000, 50),
     "run folders": (_module("run_folders", 4.0), 500, 20),
-    "soak": (_module("soak"), 400, 12),
+    "soak": (_module("soak"), 1000, 12),
     "threads": (_module("threads"), 20, 2),
     "forks": (_module("threads"), 20, 2),
     "kill -9": (_timed(_kills), 1000, 6),

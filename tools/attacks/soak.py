@@ -13,7 +13,7 @@ from warpslam.config import Config
 from warpslam.slam import Slam
 from warpslam.synthetic import SyntheticSequence
 
-CHUNK = 50
+CHUNK = 20
 _FRAMES = 60
 _WARM = 8  # tries after which caches are filled and the map is grown
 _BYTES_A_FRAME = 40_000  # a keyframe's compact image and its rows, over the frames between two
