@@ -19,6 +19,20 @@ _KINDS = {
 }  # fmt: skip
 
 
+def check_name(path: Path) -> None:
+    """Refuse what can't be the path of a file, which the system's functions tell by a `ValueError`.
+
+    Raises:
+        OSError: It is empty, ends in no name, holds a zero, or can't be written in the system's letters.
+    """
+    try:
+        if path.name and b"\0" not in os.fsencode(path):
+            return
+    except UnicodeEncodeError:
+        pass
+    raise OSError(errno.EINVAL, "is no name of a file", str(path))
+
+
 def check_regular(path: str | Path, limit: float = float("inf")) -> int:
     """Size of a file [bytes], which is a regular one: others may never end, or never begin.
 

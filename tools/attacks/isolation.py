@@ -20,16 +20,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+import psutil
 
 ROOT = Path(__file__).resolve().parents[2]
 SECONDS = 20.0
-"""A try that takes longer hangs."""
+"""A try that takes longer hangs: of the clock where it sleeps, of a core where a busy machine keeps it waiting."""
 START_SECONDS = 600.0
 """Until the first try begins: kernels may have to be compiled."""
 TYPED, UNTYPED, WRONG = "typed error", "untyped error", "wrong result"
 
 Attempt = Callable[[np.random.Generator], str]
-"""A try: says what came of it, raises an error of ours where the input was refused, and `AssertionError` where a result
+"""A try: says what came of it (and more behind a semicolon), raises an error of ours where the input was refused, and `AssertionError` where a result
 is wrong."""
 
 
@@ -44,6 +45,8 @@ class Account:
     untyped: list[str] = field(default_factory=list)
     wrong: list[str] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    """What tries told of themselves behind a semicolon."""
     seconds: float = 0.0
 
     @property
@@ -66,6 +69,8 @@ class Account:
             self.wrong.append(f"try {number}: {detail}")
         else:
             self.outcomes[outcome] += 1
+            if detail:
+                self.remarks.append(detail)
 
 
 def attack(name: str, module: str, count: int, *, seed: int = 0, build: str = "usual", memory_gb: float = 0) -> Account:
@@ -100,7 +105,8 @@ def _run_child(account: Account, arguments: list[str], first: int, folder: str) 
     assert child.stdout is not None and child.stderr is not None
     running, texts, rest = first, b"", b""
     limit = time.monotonic() + START_SECONDS
-    began = False
+    last, spent, began = limit, 0.0, False
+    process = psutil.Process(child.pid)
     with selectors.DefaultSelector() as selector:
         for stream in (child.stdout, child.stderr):
             os.set_blocking(stream.fileno(), False)
@@ -108,6 +114,9 @@ def _run_child(account: Account, arguments: list[str], first: int, folder: str) 
         while selector.get_map():
             ready = selector.select(max(limit - time.monotonic(), 0.0))
             if not ready and time.monotonic() >= limit:
+                if began and time.monotonic() < last and _is_kept_waiting(process, spent):
+                    limit += 2.0
+                    continue
                 os.killpg(child.pid, signal.SIGKILL)
                 child.wait()
                 account.hangs.append(f"try {running}: nothing for {SECONDS:g} s")
@@ -123,16 +132,45 @@ def _run_child(account: Account, arguments: list[str], first: int, folder: str) 
                     for line in lines:
                         news = json.loads(line)
                         running, limit, began = news["next"], time.monotonic() + SECONDS, True
+                        last, spent = limit + START_SECONDS, _seconds_of(process)
                         if "outcome" in news:
                             account.note(news["try"], news["outcome"], news["detail"])
     code = child.wait()
     if code == 0:
         return running
-    last = texts.decode(errors="replace").strip().splitlines()[-1:] or ["no word"]
+    words = texts.decode(errors="replace").strip().splitlines()[-1:] or ["no word"]
     if not began:
         raise RuntimeError(f"{account.name}: the tries can't begin (exit {code}): {texts.decode(errors='replace')}")
-    account.crashes.append(f"try {running}: exit {code}: {last[0][:300]}")
+    account.crashes.append(f"try {running}: exit {code}: {words[0][:300]}")
     return running + 1
+
+
+def _seconds_of(process: psutil.Process) -> float:
+    """Of a core that a process and its children have had."""
+    total = 0.0
+    with contextlib.suppress(psutil.Error):
+        for one in (process, *process.children(recursive=True)):
+            times = one.cpu_times()
+            total += times.user + times.system
+    return total
+
+
+def _is_kept_waiting(process: psutil.Process, before: float) -> bool:
+    """Whether a process that has used ``before`` seconds when its try began has not had its time yet, and wants it."""
+    if _seconds_of(process) - before >= SECONDS:
+        return False
+    for _ in range(10):
+        with contextlib.suppress(psutil.Error, OSError):
+            for one in (process, *process.children(recursive=True)):
+                states = [path.read_text().rpartition(")")[2].split()[0] for path in _threads_of(one.pid)]
+                if set(states) & {"R", "D", "T"}:
+                    return True
+        time.sleep(0.1)
+    return False
+
+
+def _threads_of(pid: int) -> list[Path]:
+    return [folder / "stat" for folder in Path(f"/proc/{pid}/task").iterdir()]
 
 
 def main() -> None:
@@ -163,7 +201,7 @@ def main() -> None:
         with contextlib.suppress(FileNotFoundError):
             os.remove(f"core.{os.getpid()}")
         try:
-            outcome = attempt(np.random.default_rng([int(seed), number]))
+            outcome, _, detail = attempt(np.random.default_rng([int(seed), number])).partition("; ")
         except WarpSlamError as error:
             outcome = TYPED
             if len(str(error)) > 4000:
