@@ -30,8 +30,8 @@ _SETTINGS = (
     "", "grid", "grid.fine_spacing.x",
 )  # fmt: skip
 _VALUES = (
-    "=0", "=-1", "=1", "=1e-9", "=1e9", "=nan", "=.inf", "=null", "=[]", "={}", "=x", "=true", "=!!python/none", "=", "",
-    "=" + "9" * 500, "=strict", "=overlapped", "=0.5", "=&a [*a]", "=\x00", "=2026-01-01",
+    "=0", "=-1", "=1", "=1e-9", "=1e9", "=nan", "=.inf", "=null", "=[]", "={}", "=x", "=true", "=!!python/none", "=",
+    "", "=" + "9" * 500, "=strict", "=overlapped", "=0.5", "=&a [*a]", "=\x00", "=2026-01-01",
 )  # fmt: skip
 
 
