@@ -43,6 +43,7 @@ FRAMES = 4
 _SETTINGS = (*scene.SMALL, "meshing.voxel=0.06")
 _SAME = ("trajectory.tum", "ground_truth.tum", "mesh.ply", "map.safetensors", "frames.csv")
 _THERE = ("metrics.json", "timing.json", "frames.json", "report.html", "panels.png", "manifest.json", "config.yaml")
+_OF_A_STOP = ("trajectory.tum", "map.safetensors", "mesh.ply", "metrics.json", "report.html")
 _LONGEST = 300.0  # [s] that a run may be kept waiting on a busy machine
 _PAGE = 4096
 _ = run, report, torch  # imported here and not in every child
@@ -219,8 +220,9 @@ def _terminated(runs: _Runs) -> Attempt:
         if ended.code == -signal.SIGTERM and logged == 0:
             return "before there was a program"
         assert ended.code in (143, 0), f"exit {ended.code} after {delay:.2f} s: {ended.text.strip()[-200:]}"
-        if frames < logged:
-            raise Lost(f"{frames} of {logged} frames after {delay:.2f} s")
+        lacking = [name for name in _OF_A_STOP if logged and not (runs.output / name).is_file()]
+        if frames < logged or lacking:
+            raise Lost(f"{frames} of {logged} frames after {delay:.2f} s, no {lacking}")
         return f"exit {ended.code}; {frames} frames, {ended.seconds - delay:.1f} s after the signal"
 
     return attempt
