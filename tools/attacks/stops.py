@@ -10,6 +10,7 @@ import builtins
 import contextlib
 import hashlib
 import io
+import json
 import os
 import re
 import resource
@@ -79,18 +80,16 @@ class _Runs:
         self.home = home
         self.output = home / "run"
         self.truth: dict[str, str] = {}
-        self.changes = 0
         self.seconds = 60.0
 
     def learn(self) -> None:
-        """The bytes of a whole run, its changes of files and its seconds."""
+        """The bytes of a whole run, and its seconds."""
         for _ in range(2):  # the first one finds nothing in the caches
             self.clear()
-            done = self.child(self.words(), _count)
+            done = self.child(self.words())
             if done.code != 0:
                 raise RuntimeError(done.text)
         self.truth, self.seconds = digests(self.output), done.seconds
-        self.changes = int(done.text.strip().splitlines()[-1].split()[-1])
 
     def clear(self) -> None:
         """Nothing of the run before is left."""
@@ -105,11 +104,11 @@ class _Runs:
     def child(
         self,
         words: list[str],
-        install: Callable[[], Callable[[], str] | None] | None = None,
+        install: Callable[[], None] | None = None,
         stop: tuple[int, float] | None = None,
     ) -> Ended:
-        """``warpslam`` in a child. ``install`` is called there first, what it returns at the end; ``stop`` is a signal
-        that the child is sent, and after how many seconds.
+        """``warpslam`` in a child. ``install`` is called there first; ``stop`` is a signal that the child is sent, and
+        after how many seconds.
         """
         said = self.home / "said.txt"
         start = time.monotonic()
@@ -163,20 +162,66 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def _at_changes(runs: _Runs) -> Attempt:
-    """Kill -9 before a change of a file; as many as there are tries, evenly spread, or all."""
+    """Kill -9 before a change of a file; as many as there are tries, evenly spread, or all.
+
+    What a kill leaves is what lies there at that moment: one run takes copies of its folder before each change.
+    """
+    runs.clear()
+    states = runs.home / "states"
+    (states / "contents").mkdir(parents=True)
+    done = runs.child(runs.words(), lambda: _before_changes(_Keeper(runs.output, states)))
+    if done.code != 0:
+        raise RuntimeError(done.text)
+    found = sorted(states.glob("*.json"))
+    known: dict[str, str] = {}
 
     def attempt(rng: np.random.Generator) -> str:
-        count = min(tries(), runs.changes)
+        count = min(tries(), len(found))
         number = number_of(rng)
         if number >= count:
             raise StopIteration
-        point = 1 + number * runs.changes // count
-        runs.clear()
-        ended = runs.child(runs.words(), lambda: _kill_at(point))
-        assert ended.code == -signal.SIGKILL, f"exit {ended.code} where change {point} was to kill it"
-        return runs.go_on()
+        state = found[number * len(found) // count].read_text()
+        if state not in known:
+            runs.clear()
+            _restore(json.loads(state), states, runs.output)
+            known[state] = runs.go_on()
+        return f"{known[state]}; {len(found)} changes, {len(known)} states so far"
 
     return attempt
+
+
+class _Keeper:
+    """Copies a folder, each content once."""
+
+    def __init__(self, folder: Path, states: Path) -> None:
+        self._folder, self._states, self._count = folder, states, 0
+
+    def __call__(self) -> None:
+        """Before a change."""
+        self._count += 1
+        state: dict[str, str | None] = {}
+        for path in sorted(self._folder.rglob("*")):
+            name = str(path.relative_to(self._folder))
+            state[name] = None
+            if path.is_file():
+                data = path.read_bytes()
+                state[name] = hashlib.sha256(data).hexdigest()
+                content = self._states / "contents" / state[name]
+                if not content.exists():
+                    content.write_bytes(data)
+        text = json.dumps(state if self._folder.is_dir() else None)
+        (self._states / f"{self._count:06d}.json").write_text(text)
+
+
+def _restore(state: dict[str, str | None] | None, states: Path, folder: Path) -> None:
+    if state is None:
+        return
+    folder.mkdir()
+    for name, digest in state.items():
+        if digest is None:
+            (folder / name).mkdir()
+        else:
+            shutil.copyfile(states / "contents" / digest, folder / name)
 
 
 def _at_moments(runs: _Runs) -> Attempt:
@@ -295,18 +340,17 @@ def _disk(folder: Path, size: int) -> Iterator[tuple[Callable[[], None] | None, 
 # -- the child -------------------------------------------------------------------------------------------------------
 
 
-def _be_child(words: list[str], home: Path, install: Callable[[], Callable[[], str] | None] | None) -> None:
+def _be_child(words: list[str], home: Path, install: Callable[[], None] | None) -> None:
     code = 1
     with contextlib.suppress(BaseException):
         # (The streams are those of the attack, whose first is the news of its tries.)
         for number, name in ((1, "shown.txt"), (2, "said.txt")):
             with open(home / name, "w") as file:
                 os.dup2(file.fileno(), number)
-        at_end = None if install is None else install()
+        if install is not None:
+            install()
         try:
             code = cli.main(words)
-            if at_end is not None:
-                os.write(2, at_end().encode())
         except SystemExit as error:
             code = int(error.code or 0)
         except BaseException:
@@ -318,29 +362,16 @@ _CHANGING = ("rename", "replace", "unlink", "remove", "mkdir", "rmdir", "fsync",
 _NEWS = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
 
-def _count() -> Callable[[], str]:
-    counted = [0]
-
-    def note() -> None:
-        counted[0] += 1
-
-    _before_changes(note)
-    return lambda: f"changes {counted[0]}\n"
-
-
-def _kill_at(point: int) -> None:
-    counted = [0]
-
-    def note() -> None:
-        counted[0] += 1
-        if counted[0] == point:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    _before_changes(note)
-
-
 def _before_changes(note: Callable[[], None]) -> None:
-    """Call ``note`` before whatever changes a file of the attack."""
+    """Call ``note`` before whatever changes a file of the attack, but for its own changes."""
+    is_noting = False
+
+    def noted() -> None:
+        nonlocal is_noting
+        if not is_noting:
+            is_noting = True
+            note()
+            is_noting = False
 
     def is_ours(path: Any, folder: Any = None) -> bool:
         with contextlib.suppress(OSError, TypeError):
@@ -353,7 +384,7 @@ def _before_changes(note: Callable[[], None]) -> None:
     def counted(function: Any) -> Any:
         def call(path: Any, *rest: Any, **keywords: Any) -> Any:
             if is_ours(path, keywords.get("dir_fd") or keywords.get("src_dir_fd")):
-                note()
+                noted()
             return function(path, *rest, **keywords)
 
         return call
@@ -364,12 +395,12 @@ def _before_changes(note: Callable[[], None]) -> None:
 
     def counted_descriptor(path: Any, flags: int, *rest: Any, **keywords: Any) -> Any:
         if flags & _NEWS and is_ours(path, keywords.get("dir_fd")):
-            note()
+            noted()
         return real_open(path, flags, *rest, **keywords)
 
     def counted_open(file: Any, mode: str = "r", *rest: Any, **keywords: Any) -> Any:
         if set(mode) & set("wax+") and not isinstance(file, int) and is_ours(file):
-            note()
+            noted()
         return open_file(file, mode, *rest, **keywords)
 
     os.open = counted_descriptor
