@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -222,6 +223,21 @@ def test_second_signal_ends_the_writing(fake_slam, tmp_path, monkeypatch):
     result = run_sequence(FakeSequence(4), Config(), tmp_path)
     assert result.status == metrics_of(tmp_path)["status"] == "interrupted"
     assert result.folder.trajectory.is_file() and not result.folder.mesh.exists()
+
+
+def test_every_result_has_its_name_when_it_is_whole(fake_slam, tmp_path, monkeypatch):
+    """A kill in the middle of a write leaves no half of a file under the name of a whole one."""
+    moved, move = set(), os.replace
+
+    def recorded(source, target, **keywords):
+        moved.add(Path(target).name)
+        move(source, target, **keywords)
+
+    monkeypatch.setattr(os, "replace", recorded)
+    run_sequence(FakeSequence(4), Config(), tmp_path, source=Source("somewhere"))
+    written = {path.name for path in tmp_path.iterdir()}
+    # Settings come first and are written again by a run that is resumed; this map is the fake's.
+    assert written - moved == {"config.yaml", "log.txt", "map.safetensors"} and len(moved) > 10
 
 
 def test_failure_writes_metrics_and_passes_on(fake_slam, tmp_path):
