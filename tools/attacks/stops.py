@@ -9,6 +9,7 @@ from __future__ import annotations
 import builtins
 import contextlib
 import hashlib
+import importlib
 import io
 import json
 import os
@@ -28,12 +29,10 @@ from typing import Any
 
 import numpy as np
 import psutil
-import torch
 
 from tools.attacks import scene
 from tools.attacks.isolation import SECONDS, Attempt, Hang, Lost, Untyped, is_kept_waiting, number_of, tries
 from warpslam import cli
-from warpslam.cli import report, run
 from warpslam.pipeline.setup import load_kernels
 from warpslam.runs.folder import RunFolder
 from warpslam.synthetic import SyntheticSequence, write_sequence
@@ -47,16 +46,24 @@ _THERE = ("metrics.json", "timing.json", "frames.json", "report.html", "panels.p
 _OF_A_STOP = ("trajectory.tum", "map.safetensors", "mesh.ply", "metrics.json", "report.html")
 _LONGEST = 300.0  # [s] that a run may be kept waiting on a busy machine
 _PAGE = 4096
-_ = run, report, torch  # imported here and not in every child
+_STREAMS = ("shown.txt", "said.txt")  # standard output and standard error of a child
+_NEEDED = (
+    "warpslam.cli.run", "warpslam.cli.report", "torch", "matplotlib.figure", "matplotlib.backends.backend_agg",
+    "scipy.spatial", "trimesh", "rich.progress",
+)  # fmt: skip
+"""Imported before the tries, and not in every child."""
 
 
 def prepare(name: str) -> Attempt:
     """``name`` is one of `_ATTEMPTS`."""
     home = Path(tempfile.mkdtemp(prefix="warpslam-attacks-"))
     sequence = SyntheticSequence(1, FRAMES, intrinsics=scene.CAMERA)
-    write_sequence(sequence, home / "sequence")
-    load_kernels(sequence, "cpu", lambda progress: None)
+    load_kernels(sequence, "cpu")
+    for module in _NEEDED:
+        importlib.import_module(module)
     runs = _Runs(home)
+    # Threads of libraries do not outlive a fork: whatever might begin one is done in a child.
+    runs.child([], lambda: write_sequence(sequence, home / "sequence"))
     runs.learn()
     return _ATTEMPTS[name](runs)
 
@@ -110,7 +117,8 @@ class _Runs:
         """``warpslam`` in a child. ``install`` is called there first; ``stop`` is a signal that the child is sent, and
         after how many seconds.
         """
-        said = self.home / "said.txt"
+        for name in _STREAMS:
+            (self.home / name).unlink(missing_ok=True)
         start = time.monotonic()
         pid = os.fork()
         if pid == 0:
@@ -133,14 +141,15 @@ class _Runs:
                 os.waitpid(pid, 0)
                 raise Hang(f"a run that did not end within {now - start:.0f} s")
             time.sleep(0.002)
-        text = said.read_text(errors="replace")
+        text = self.said("said.txt")
         if "Traceback" in text:
             raise Untyped(text.strip().splitlines()[-1][:200])
         return Ended(os.waitstatus_to_exitcode(status), text, now - start)
 
-    def has_shown_frames(self) -> bool:
-        """Whether the last child got as far as to process one."""
-        return "frame 1/" in (self.home / "shown.txt").read_text(errors="replace")
+    def said(self, name: str) -> str:
+        """What the last child wrote to one of its `_STREAMS`."""
+        path = self.home / name
+        return path.read_text(errors="replace") if path.is_file() else ""
 
     def go_on(self) -> str:
         """After a stop: with what there is, the run comes to the bytes that it would have had."""
@@ -149,16 +158,19 @@ class _Runs:
         done = self.child(["run", "--resume", str(self.output)] if begun else self.words())
         if done.code != 0:
             raise Lost(f"exit {done.code}: {done.text.strip()[-300:]}")
-        if digests(self.output) != self.truth:
-            raise AssertionError("other bytes")
+        if other := [name for name, digest in digests(self.output).items() if digest != self.truth[name]]:
+            raise AssertionError(f"other bytes of {', '.join(other)}")
         if missing := [name for name in _THERE if not (self.output / name).is_file()]:
             raise Lost(f"no {', '.join(missing)}")
         return "the same bytes" if begun else "nothing was there yet"
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """Of the files that a stop must not change."""
-    return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in _SAME}
+    """Of the files that a stop must not change; empty where one is not there."""
+    files = {name: folder / name for name in _SAME}
+    return {
+        name: hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "" for name, path in files.items()
+    }
 
 
 def _at_changes(runs: _Runs) -> Attempt:
@@ -245,7 +257,7 @@ def _in_writes(runs: _Runs) -> Attempt:
 
     def attempt(rng: np.random.Generator) -> str:
         runs.clear()
-        size = int(10.0 ** rng.uniform(1.0, 7.0))
+        size = int(10.0 ** rng.uniform(2.5, 7.0))
         runs.child(runs.words(), lambda: install(size))
         return runs.go_on()
 
@@ -261,13 +273,13 @@ def _terminated(runs: _Runs) -> Attempt:
         ended = runs.child(runs.words(checkpoints=False), stop=(signal.SIGTERM, delay))
         folder = RunFolder(runs.output)
         frames = len(folder.trajectory.read_text().splitlines()) - 1 if folder.trajectory.is_file() else 0
-        logged = folder.log.read_text().count(": frame ") if folder.log.is_file() else 0
-        if ended.code == -signal.SIGTERM and logged == 0:
+        shown = len(re.findall(r"^frame \d+/", runs.said("shown.txt"), re.MULTILINE))
+        if ended.code == -signal.SIGTERM and shown == 0:
             return "before there was a program"
         assert ended.code in (143, 0), f"exit {ended.code} after {delay:.2f} s: {ended.text.strip()[-200:]}"
-        lacking = [name for name in _OF_A_STOP if logged and not (runs.output / name).is_file()]
-        if frames < logged or lacking:
-            raise Lost(f"{frames} of {logged} frames after {delay:.2f} s, no {lacking}")
+        lacking = [name for name in _OF_A_STOP if shown and not (runs.output / name).is_file()]
+        if frames < shown or lacking:
+            raise Lost(f"{frames} of {shown} frames after {delay:.2f} s, no {lacking}")
         return f"exit {ended.code}; {frames} frames, {ended.seconds - delay:.1f} s after the signal"
 
     return attempt
@@ -289,7 +301,7 @@ def _full_disks(runs: _Runs, *, checkpoints: bool) -> Attempt:
                 found = re.search(r"trajectory so far is in (\S+)", done.text)
                 if found and Path(found[1]).is_file():
                     return "trajectory elsewhere"
-                if runs.has_shown_frames():
+                if "frame 1/" in runs.said("shown.txt"):
                     raise Lost(f"disk of {size / 1e3:.0f} kB: no trajectory: {done.text.strip()[-200:]}")
                 return "one line"
             again = runs.child(["report", str(runs.output)])
@@ -344,13 +356,13 @@ def _be_child(words: list[str], home: Path, install: Callable[[], None] | None) 
     code = 1
     with contextlib.suppress(BaseException):
         # (The streams are those of the attack, whose first is the news of its tries.)
-        for number, name in ((1, "shown.txt"), (2, "said.txt")):
+        for number, name in enumerate(_STREAMS, 1):
             with open(home / name, "w") as file:
                 os.dup2(file.fileno(), number)
-        if install is not None:
-            install()
         try:
-            code = cli.main(words)
+            if install is not None:
+                install()
+            code = cli.main(words) if words else 0
         except SystemExit as error:
             code = int(error.code or 0)
         except BaseException:
@@ -378,7 +390,7 @@ def _before_changes(note: Callable[[], None]) -> None:
             name = os.readlink(f"/proc/self/fd/{path}") if isinstance(path, int) else os.fsdecode(path)
             if folder is not None:
                 name = os.path.join(os.readlink(f"/proc/self/fd/{folder}"), name)
-            return "warpslam-attacks-" in os.path.abspath(name) and not name.endswith(("said.txt", "shown.txt"))
+            return "warpslam-attacks-" in os.path.abspath(name) and not name.endswith(_STREAMS)
         return False
 
     def counted(function: Any) -> Any:
