@@ -18,6 +18,7 @@ import resource
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 import traceback
@@ -45,6 +46,7 @@ _SAME = ("trajectory.tum", "ground_truth.tum", "mesh.ply", "map.safetensors", "f
 _THERE = ("metrics.json", "timing.json", "frames.json", "report.html", "panels.png", "manifest.json", "config.yaml")
 _OF_A_STOP = ("trajectory.tum", "map.safetensors", "mesh.ply", "metrics.json", "report.html")
 _LONGEST = 300.0  # [s] that a run may be kept waiting on a busy machine
+_START = 4.0  # [s] that a program may need to begin
 _PAGE = 4096
 _STREAMS = ("shown.txt", "said.txt")  # standard output and standard error of a child
 _NEEDED = (
@@ -269,6 +271,8 @@ def _terminated(runs: _Runs) -> Attempt:
 
     def attempt(rng: np.random.Generator) -> str:
         runs.clear()
+        if number_of(rng) % 4 == 3:
+            return _while_starting(runs, rng.uniform(0.0, _START))
         delay = rng.uniform(0.0, runs.seconds)
         ended = runs.child(runs.words(checkpoints=False), stop=(signal.SIGTERM, delay))
         folder = RunFolder(runs.output)
@@ -283,6 +287,25 @@ def _terminated(runs: _Runs) -> Attempt:
         return f"exit {ended.code}; {frames} frames, {ended.seconds - delay:.1f} s after the signal"
 
     return attempt
+
+
+def _while_starting(runs: _Runs, delay: float) -> str:
+    """SIGTERM to a process that may still be importing."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "warpslam", *runs.words()], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    time.sleep(delay)
+    process.send_signal(signal.SIGTERM)
+    try:
+        _, text = process.communicate(timeout=_LONGEST)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+        raise Hang(f"SIGTERM {delay:.2f} s after its start") from None
+    if "Traceback" in text:
+        raise Untyped(f"{delay:.2f} s after its start: {text.strip().splitlines()[-1][:200]}")
+    assert process.returncode in (143, -signal.SIGTERM), f"exit {process.returncode} {delay:.2f} s after its start"
+    return "while it started"
 
 
 def _full_disks(runs: _Runs, *, checkpoints: bool) -> Attempt:
