@@ -59,14 +59,14 @@ KINDS: dict[str, tuple[Callable[[str, int, int], Account], int, int]] = {
 def table(accounts: list[Account]) -> str:
     """As Markdown."""
     lines = [
-        "| attack | tries | came back | refused, typed | untyped | crashes | hangs > 20 s | wrong | lost | s |",
+        "| attack | tries | refused, typed | right result | crashes | untyped | hangs > 20 s | wrong | lost | s |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for one in accounts:
         typed = one.outcomes.get("typed error", 0)
         back = sum(one.outcomes.values()) - typed
-        failures = [len(part) for part in (one.untyped, one.crashes, one.hangs, one.wrong, one.lost)]
-        cells = [one.name, one.tries, back, typed, *failures, f"{one.seconds:.0f}"]
+        failures = [len(part) for part in (one.crashes, one.untyped, one.hangs, one.wrong, one.lost)]
+        cells = [one.name, one.tries, typed, back, *failures, f"{one.seconds:.0f}"]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines)
 
