@@ -21,7 +21,7 @@ from warpslam.slam import Slam
 
 _PATHS = (
     "map", "", "a/b/map", "\0", "x" * 300, "\udcff", "new\nline\x1b[31m", "/dev/null", "/dev/full", "/proc/self/mem",
-    "/proc/version", ".", "~", "map.safetensors/map",
+    "/proc/version", "/proc/kmsg", ".", "~", "map.safetensors/map",
 )  # fmt: skip
 _SETTINGS = (
     "grid.margin", "grid.fine_spacing", "grid.max_gigabytes", "grid.max_depth", "mapping.pixels", "mapping.window",

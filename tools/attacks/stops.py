@@ -34,14 +34,20 @@ import psutil
 from tools.attacks import scene
 from tools.attacks.isolation import SECONDS, Attempt, Hang, Lost, Untyped, is_kept_waiting, number_of, tries
 from warpslam import cli
+from warpslam.pipeline import results
 from warpslam.pipeline.setup import load_kernels
+from warpslam.report import pictures
 from warpslam.runs.folder import RunFolder
 from warpslam.synthetic import SyntheticSequence, write_sequence
 
 __all__ = ["prepare"]
 
 FRAMES = 4
-_SETTINGS = (*scene.SMALL, "meshing.voxel=0.06")
+_SETTINGS = (
+    *scene.SMALL, "meshing.voxel=0.1", "grid.middle_spacing=0.64", "grid.fine_spacing=0.32", "grid.color_spacing=0.32",
+    "mapping.pixels=64", "mapping.first_iterations=3", "mapping.iterations=2", "mapping.coarse_iterations=1",
+    "mapping.active_share=0", "mapping.window=2",
+)  # fmt: skip
 _SAME = ("trajectory.tum", "ground_truth.tum", "mesh.ply", "map.safetensors", "frames.csv")
 _THERE = ("metrics.json", "timing.json", "frames.json", "report.html", "panels.png", "manifest.json", "config.yaml")
 _OF_A_STOP = ("trajectory.tum", "map.safetensors", "mesh.ply", "metrics.json", "report.html")
@@ -63,6 +69,7 @@ def prepare(name: str) -> Attempt:
     load_kernels(sequence, "cpu")
     for module in _NEEDED:
         importlib.import_module(module)
+    results.PANEL_COUNT = pictures.SUPERSAMPLING = 1  # figures take longer than all else
     runs = _Runs(home)
     # Threads of libraries do not outlive a fork: whatever might begin one is done in a child.
     runs.child([], lambda: write_sequence(sequence, home / "sequence"))
