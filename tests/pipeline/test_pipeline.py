@@ -192,7 +192,7 @@ def test_second_interrupt_ends_the_writing(fake_slam, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("step", ["write_trajectory", "write_map", "extract_and_write_mesh", "draw_panels"])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_first_signal_while_results_are_written_waits_for_them(fake_slam, tmp_path, monkeypatch, step, number):
+def test_first_signal_while_results_are_written_waits_for_them(fake_slam, ctrl_c, tmp_path, monkeypatch, step, number):
     """Nothing was asked to stop before, so everything is written; the run says that it was interrupted."""
     function = getattr(pipeline, step)
 
@@ -211,7 +211,7 @@ def test_first_signal_while_results_are_written_waits_for_them(fake_slam, tmp_pa
     assert all(path.is_file() for path in (folder.trajectory, folder.map, folder.mesh, folder.panels, folder.report))
 
 
-def test_second_signal_ends_the_writing(fake_slam, tmp_path, monkeypatch):
+def test_second_signal_ends_the_writing(fake_slam, ctrl_c, tmp_path, monkeypatch):
     """It is not kept back."""
 
     def impatient(*arguments):

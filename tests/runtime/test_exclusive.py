@@ -114,7 +114,7 @@ def test_sigterm_is_an_interrupt_with_its_own_exit_code(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_while_a_command_is_imported_is_a_line(monkeypatch, capsys, number, code):
+def test_a_signal_while_a_command_is_imported_is_a_line(ctrl_c, monkeypatch, capsys, number, code):
     """Importing a command takes seconds; to be stopped then is no traceback either."""
 
     def importing(arguments):
@@ -126,7 +126,7 @@ def test_a_signal_while_a_command_is_imported_is_a_line(monkeypatch, capsys, num
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_the_first_signal_is_kept_back_and_the_second_is_not():
+def test_the_first_signal_is_kept_back_and_the_second_is_not(ctrl_c):
     """Of both kinds, from `defer` on; afterwards the handlers are what they were."""
     with terminable():
         before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
