@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -64,7 +65,8 @@ def _checkpoints(folder: Path) -> Attempt:
     request = resolve(request, sequence)
     run_folder = RunFolder(folder / "run")
     whole = folder / "whole.safetensors"
-    run(request, run_folder.path, sequence=sequence, observer=_Copier(run_folder.checkpoint, whole))
+    with contextlib.suppress(_Enough):
+        run(request, run_folder.path, sequence=sequence, observer=_Copier(run_folder.checkpoint, whole))
     frame = scene.frames()[4]
 
     def attempt(rng: np.random.Generator) -> str:
@@ -77,14 +79,20 @@ def _checkpoints(folder: Path) -> Attempt:
     return attempt
 
 
+class _Enough(Exception):  # noqa: N818
+    """The checkpoint is there, and the rest of the run of no use."""
+
+
 class _Copier(Observer):
-    """Keeps the last checkpoint of a run."""
+    """Keeps the second checkpoint of a run."""
 
     def __init__(self, checkpoint: Path, copy: Path) -> None:
         self._checkpoint, self._copy = checkpoint, copy
 
     def frame(self, progress: Progress) -> None:
-        shutil.copyfile(self._checkpoint, self._copy)
+        if progress.done == 3:
+            shutil.copyfile(self._checkpoint, self._copy)
+            raise _Enough
 
 
 def _decoders(folder: Path) -> Attempt:

@@ -37,7 +37,7 @@ def prepare(name: str) -> Attempt:
     sequence = SyntheticSequence(1, 3, intrinsics=scene.CAMERA)
     write_sequence(sequence, home / "sequence")
     whole = home / "whole"
-    settings = (*scene.SMALL, "meshing.voxel=0.1")
+    settings = (*scene.SMALL, "meshing.voxel=0.1", "mapping.first_iterations=5", "mapping.iterations=2")
     request = RunRequest(Source(str(home / "sequence")), overrides=settings, preset="default", device="cpu")
     run(request, whole)
 
