@@ -163,7 +163,7 @@ class _Runs:
     def go_on(self) -> str:
         """After a stop: with what there is, the run comes to the bytes that it would have had."""
         folder = RunFolder(self.output)
-        begun = folder.is_unfinished or folder.has_results or folder.metrics.is_file()
+        begun = folder.is_unfinished or folder.has_results
         done = self.child(["run", "--resume", str(self.output)] if begun else self.words())
         if done.code != 0:
             raise Lost(f"exit {done.code}: {done.text.strip()[-300:]}")
