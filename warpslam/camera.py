@@ -22,7 +22,10 @@ def is_number(value: Any) -> bool:
 
     (`numpy.isfinite` raises for what is no number, and for whole ones of more than 64 bits.)
     """
-    return isinstance(value, Real) and not isinstance(value, bool) and bool(abs(value) < _ABSURD)
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    number: Any = value
+    return bool(abs(number) < _ABSURD)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -38,7 +39,7 @@ def save_panels(path: Path, panels: list[Panel]) -> None:
     def millimetres(depth: np.ndarray) -> np.ndarray:
         return np.rint(np.clip(np.nan_to_num(depth) * 1000, 0, 65535)).astype(np.uint16)
 
-    images = {
+    images: dict[str, Any] = {
         "index": np.array([panel.index for panel in panels]),
         "rgb": np.stack([panel.rgb for panel in panels]),
         "depth": np.stack([millimetres(panel.depth) for panel in panels]),
