@@ -80,9 +80,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str]) -> int:
-    options = _parser(arguments).parse_args(arguments)
-    options.command_line = shlex.join(["warpslam", *arguments])
+    is_debugging = False
     try:
+        options = _parser(arguments).parse_args(arguments)  # imports for seconds, in which ctrl-C may come
+        options.command_line = shlex.join(["warpslam", *arguments])
+        is_debugging = options.debug
         code: int = options.command(options)
         sys.stdout.flush()
         return code
@@ -93,7 +95,7 @@ def _main(arguments: Sequence[str]) -> int:
         print(f"warpslam: {'terminated' if isinstance(error, Terminated) else 'interrupted'}", file=sys.stderr)
         return EXIT_INTERRUPTED
     except Exception as error:
-        if options.debug:
+        if is_debugging:
             raise
         code, text = _told(error)
         print(f"warpslam: {printable(text)}", file=sys.stderr)

@@ -17,13 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any, Protocol
 
 import numpy as np
 import trimesh
 import warp as wp
 
+from warpslam.camera import is_number
 from warpslam.errors import InputError, MeshError
 from warpslam.meshing.cleaning import Hull, face_vectors, keep_faces, piece_areas, vertex_normals
 from warpslam.meshing.marching_cubes import Surface, all_corners, touched_points
@@ -405,13 +405,11 @@ def _check_arguments(
         ("behind_surface", behind, True),
         ("band", 1.0 if band is None else band, False),
     ):
-        if isinstance(value, bool) or not isinstance(value, Real) or abs(value) > 1e300:
-            raise InputError(f"{name} = {value!r} must be a number that is not absurd")
-        if not np.isfinite(value) or value < 0 or (value == 0 and not low_ok):
+        if not is_number(value) or value < 0 or (value == 0 and not low_ok):
             raise InputError(f"{name} = {value!r} must be a finite number {'of at least' if low_ok else 'above'} 0")
-    if not np.isfinite(level_set):
-        raise InputError(f"level_set = {level_set!r} must be finite")
-    if block_cells != int(block_cells) or block_cells < 1:
+    if not is_number(level_set):
+        raise InputError(f"level_set = {level_set!r} must be a finite number")
+    if not is_number(block_cells) or block_cells != int(block_cells) or block_cells < 1:
         raise InputError(f"block_cells = {block_cells!r} must be a whole number of at least 1")
 
 

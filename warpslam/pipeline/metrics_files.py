@@ -15,6 +15,7 @@ from warpslam.camera import SensorTiming
 from warpslam.frames import FrameStatus
 from warpslam.runs.record import UNREADABLE, RunRecord
 from warpslam.runtime.environment import package_versions, peak_memory_mib
+from warpslam.storage.atomic import replacing
 from warpslam.storage.json_files import write_json
 
 if TYPE_CHECKING:
@@ -91,7 +92,10 @@ def write_timing(folder: RunFolder, record: RunRecord, modules: Sequence[ModuleP
 def write_frames(folder: RunFolder, record: RunRecord) -> None:
     """What became of each frame: all of it for the report, and a table of it."""
     write_json(folder.frame_records, record.to_rows())
-    with open(folder.frames, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
+    with (
+        replacing(folder.frames) as partial,
+        open(partial, "w", newline="", encoding="utf-8", errors="backslashreplace") as file,
+    ):
         writer = csv.writer(file, lineterminator="\n")
         columns = ["inliers", "depth_error_m", "correlation", "sigma_m", "sigma_deg"]
         writer.writerow(["frame", "timestamp", "status", *columns, "message"])

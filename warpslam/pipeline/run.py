@@ -57,6 +57,7 @@ from warpslam.runs.metrics import RunMetrics
 from warpslam.runs.record import FAILED, FINISHED, INTERRUPTED, UNFINISHED, RunRecord, RunResult
 from warpslam.runs.request import RunRequest, SequenceFacts
 from warpslam.runtime.kernel_cache import kernel_cache_errors
+from warpslam.runtime.stopping import Deferral
 from warpslam.sequences.checking import ERROR, OK, check_sequence
 from warpslam.storage.atomic import sync_folder
 from warpslam.storage.locked_folder import locked
@@ -191,6 +192,7 @@ class Run:
 
     _marks: dict[str, tuple[int, int]] = field(default_factory=dict)
     _unwritten: Exception | None = None
+    _stopping: Deferral = field(default_factory=Deferral)
     slam: Method | None = None
     ate: AteResult | None = None
     reconstruction: ReconstructionResult | None = None
@@ -205,30 +207,39 @@ class Run:
             self.metrics.resumed_after = self.record.position
 
     def execute(self) -> RunResult:
-        """All steps, one after the other. Whatever ends them, what there is by then is written; checkpoints go last."""
+        """All steps, one after the other. Whatever ends them, what there is by then is written; checkpoints go last.
+
+        A request to stop ends the frames, or what is done to the map after them; one that comes while the results are
+        written waits for them; a second one ends that as well.
+        """
         self._marks = self.folder.marks()
-        try:
-            with self.record.clock("total"):
-                with self._interruptible():
-                    self._admit_input()
-                    self._check_input()
-                    self._build()
-                    self._process_frames()
-                    self._finish_map()
-                if self.record.results:
-                    self._write_results()
-        except KeyboardInterrupt:
-            self.status = INTERRUPTED
-        except OSError as error:
-            self._fail(error)
-            raise output_error(error, self.folder.path) from error
-        except Exception as error:
-            self._fail(error)
-            raise
-        finally:
-            self._write_account()
-        if self.status == FINISHED:
-            self._close()
+        with self._stopping:
+            try:
+                with self.record.clock("total"):
+                    with self._interruptible():
+                        self._admit_input()
+                        self._check_input()
+                        self._build()
+                        self._process_frames()
+                        self._finish_map()
+                        self._stopping.defer()
+                    if self.record.results:
+                        self._write_results()
+                    if self._stopping.has_come:
+                        self.status = INTERRUPTED
+                        log.warning("interrupted while the results were written: they are whole")
+            except KeyboardInterrupt:
+                self.status = INTERRUPTED
+            except OSError as error:
+                self._fail(error)
+                raise output_error(error, self.folder.path) from error
+            except Exception as error:
+                self._fail(error)
+                raise
+            finally:
+                self._write_account()
+            if self.status == FINISHED:
+                self._close()
         return RunResult(self.folder, self.status, self.metrics, self.ate, self.reconstruction)
 
     def _close(self) -> None:
@@ -447,6 +458,7 @@ class Run:
 
     def _fail(self, error: Exception) -> None:
         """Note the failure, and save what is worth it and was not saved yet: the map where it only must not grow."""
+        self._stopping.defer()
         self.status = FAILED
         self.metrics.error = f"{type(error).__name__}: {error}"
         log.exception("the run failed")

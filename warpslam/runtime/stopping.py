@@ -1,4 +1,6 @@
-"""A request to stop that comes from outside: SIGTERM is what ctrl-C is, but for the exit code."""
+"""A request to stop that comes from outside: SIGTERM is what ctrl-C is, but for the exit code; and what may be finished
+all the same.
+"""
 
 from __future__ import annotations
 
@@ -38,3 +40,42 @@ def terminable() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+class Deferral:
+    """Keeps the first request to stop back, from `defer` on: what is being done then is short, and dear if it is lost.
+
+    The second one is as ever. A context, which gives the signals back to whom they belonged. Without effect outside the
+    main thread, and for signals that nobody handles.
+    """
+
+    def __init__(self) -> None:
+        self.has_come = False
+        """Whether one was kept back."""
+        self._before: dict[int, Any] = {}
+
+    def defer(self) -> None:
+        """From now on."""
+        if threading.current_thread() is not threading.main_thread() or self._before or self.has_come:
+            return
+        for number in (signal.SIGINT, signal.SIGTERM):
+            handler = signal.getsignal(number)
+            if callable(handler):
+                self._before[number] = handler
+                signal.signal(number, self._keep_back)
+
+    def _keep_back(self, number: int, frame: Any) -> None:
+        self.has_come = True
+        if number == signal.SIGTERM:
+            _arrived.set()
+        self._give_back()
+
+    def _give_back(self) -> None:
+        while self._before:
+            signal.signal(*self._before.popitem())
+
+    def __enter__(self) -> Deferral:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._give_back()
