@@ -30,7 +30,7 @@ def add(commands: Any) -> None:
     """Add the command."""
     warmup = add_command(commands, "warmup", _warmup, "compile all kernels ahead of the first run")
     warmup.formatter_class = argparse.RawDescriptionHelpFormatter
-    warmup.epilog = _EXPLANATION
+    warmup.epilog = f"{_EXPLANATION.strip()}\n\n{warmup.epilog}"
     warmup.add_argument("--device", help="cpu, cuda, cuda:1, or an architecture: sm_80, ... (default: a GPU, or cpu)")
 
 

@@ -271,6 +271,32 @@ class DirectConfig(_Group):
     relocalization_keyframes: int = Field(60, ge=1, description="latest keyframes that a lost camera is looked for at")
 
 
+class LoopConfig(_Group):
+    """Loops, with direct tracking: known places are recognised, and a pose graph mends what was drifted."""
+
+    enabled: bool = Field(False, description="look for loops at each keyframe; needs the package gtsam")
+    candidates: int = Field(1, ge=0, le=20, description="old keyframes that a new one is compared with by its words")
+    places: int = Field(4, ge=0, le=20, description="keyframes that a lost camera is looked for at by its words")
+    drift: float = Field(
+        0.05,
+        ge=0,
+        description="drift that tracking is believed to be capable of, as a share of the way; a loop that asks for "
+        "more is none",
+    )
+    drift_floor: float = Field(0.2, ge=0, description="and on no way at all [m]")
+    turn_drift: float = Field(0.5, ge=0, description="the same as an angle, for a metre of way [degrees]")
+    turn_floor: float = Field(5.0, ge=0, description="and on no way at all [degrees]")
+    own_part_after: int = Field(
+        10,
+        ge=0,
+        description="frames of a camera switched on in a map, in which it recognises nothing, after which it is mapped "
+        "on its own, until a place is recognised; 0 = never",
+    )
+    remapping: float = Field(
+        1.0, gt=0, description="iterations where the map is made anew, as a multiple of those that went into it"
+    )
+
+
 class KeyframeConfig(_Group):
     """Keyframe selection (Sec. 3.4)."""
 
@@ -346,6 +372,7 @@ class Config(_Group):
     sampling: SamplingConfig = Field(default_factory=SamplingConfig)
     tracking: TrackingConfig = Field(default_factory=TrackingConfig)
     direct: DirectConfig = Field(default_factory=DirectConfig)
+    loops: LoopConfig = Field(default_factory=LoopConfig)
     mapping: MappingConfig = Field(default_factory=MappingConfig)
     supervision: SupervisionConfig = Field(default_factory=SupervisionConfig)
     keyframes: KeyframeConfig = Field(default_factory=KeyframeConfig)

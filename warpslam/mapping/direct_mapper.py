@@ -22,7 +22,7 @@ from warpslam.field.seeds import ray_seed
 from warpslam.field.supervision import place_band, supervise
 from warpslam.kernels.supervision import Band, Target
 from warpslam.mapping.frustum import mark_seen
-from warpslam.mapping.mapper import MappingResult
+from warpslam.mapping.mapper import MappingResult, all_rows
 from warpslam.mapping.probe import Probe
 from warpslam.mapping.window import random_keyframes, replayed_keyframes
 from warpslam.poses import vector_from_pose
@@ -90,6 +90,8 @@ class DirectMapper:
         }
         self._decoder = ColorDecoderOptimizer(self._launcher)
         self._decoder.begin()
+        self._free: dict[str, np.ndarray] | None = None
+        self._is_restricted = False
         self._probe = Probe(PARTS, PROBED_SHARE, settings, self._target, self._band, device, self._launcher)
         self._window = wp.zeros(PARTS, dtype=int, device=device)
         self._poses = wp.zeros((PARTS, 7), dtype=float, device=device)
@@ -132,8 +134,32 @@ class DirectMapper:
             result = self._optimize(images, frame, pose, window, self.config.iterations, round_=1 + round_)()
         return result
 
+    def restrict(self, free: dict[str, np.ndarray] | None, renewed: dict[str, np.ndarray]) -> None:
+        """From now on only rows that are true change, bool (rows,) by level, and no decoder; None ends it.
+
+        renewed: Rows, int (n,) by level, whose features were begun again.
+        """
+        self._fit()
+        for level, rows in self._rows.items():
+            rows.hold(None if free is None else ~free[level])
+            if level in renewed:
+                rows.forget(renewed[level])
+        self._is_restricted = free is not None
+        self._free = self._free if free is None else free  # what was free has changed, until the next call
+
+    def map_again(
+        self, images: ImagePool, keyframe: Keyframe, keyframes: list[Keyframe], iterations: int, round_: int
+    ) -> MappingResult:
+        """Map a keyframe, whose image is in slot 0, together with others that see the same."""
+        rng = np.random.default_rng([self.seed, 2, keyframe.index, round_])
+        count = round(PARTS * self.supervision.replay_share)
+        replayed = replayed_keyframes(keyframes, count, rng, images, keyframe.pose, self.camera)
+        return self._optimize(images, keyframe.index, keyframe.pose, replayed, iterations, round_=round_)()
+
     def changed_rows(self) -> dict[str, wp.array]:
         """Rows of each level that the last call may have changed, int (n,); levels it left alone are absent."""
+        if self._free is not None:
+            return all_rows(self._free, self.device)
         return {level: self._rows[level].changed_rows() for level in self._rates}
 
     def state(self) -> dict[str, TouchedRowsState]:
@@ -167,6 +193,8 @@ class DirectMapper:
         on_iteration: Callable | None = None,
     ) -> Callable[[], MappingResult]:
         """Launch a whole call; what is returned reads its outcome."""
+        if not self._is_restricted:
+            self._free = None
         self._fit()
         for rows in self._rows.values():
             rows.begin()
@@ -185,6 +213,8 @@ class DirectMapper:
         uses += [rows.updates for rows in self._rows.values()]
         if self.config.moved_margin > 0:
             uses += [frame, round_]  # the pose is an argument of what is recorded
+        if self._is_restricted:
+            uses += ["restricted"]
         for n in range(iterations):
             self._launcher.iterate("direct", tuple(uses), partial(self._iterate, images, len(window), pose))
             if on_iteration is not None:
@@ -194,7 +224,7 @@ class DirectMapper:
     def _iterate(self, images: ImagePool, current: int, pose: np.ndarray) -> None:
         """One iteration; nothing in it may depend on its number or the frame, because it is replayed."""
         batch, arrays, launcher = self._batch, self.scene.arrays(), self._launcher
-        train_decoder = self.config.train_color_decoder
+        train_decoder = self.config.train_color_decoder and not self._is_restricted
         gradients = Gradients(
             grids={level: self._rows[level].wanted() for level in self._rates},
             color_weights=self._decoder.gradient if train_decoder else None,

@@ -41,6 +41,17 @@ class MapOptimizer(Protocol):
     ) -> MappingResult:
         """Go on with the whole map after the last frame, for several rounds, whose numbers are part of the seeds."""
 
+    def restrict(self, free: dict[str, np.ndarray] | None, renewed: dict[str, np.ndarray]) -> None:
+        """From now on only rows that are true change, bool (rows,) by level, and no decoder; None ends it.
+
+        renewed: Rows, int (n,) by level, whose features were begun again.
+        """
+
+    def map_again(
+        self, images: ImagePool, keyframe: Keyframe, keyframes: list[Keyframe], iterations: int, round_: int
+    ) -> MappingResult:
+        """Map a keyframe, whose image is in slot 0, together with others that see the same."""
+
     def changed_rows(self) -> dict[str, wp.array]:
         """Rows of each level that the last call may have changed, int (n,); levels it left alone are absent."""
 

@@ -219,6 +219,53 @@ def _mesh_block(
         surface.add_block(logits, forecast_cells, start, level_set, _FORECAST)
 
 
+@dataclass(frozen=True)
+class BlockMesh:
+    """The surface in a box of the lattice."""
+
+    vertices: np.ndarray
+    """Shape (V, 3) [m]."""
+    faces: np.ndarray
+    """Indices of vertices, shape (F, 3); normals point to free space."""
+    colors: np.ndarray
+    """RGBA of the vertices, uint8 (V, 4)."""
+
+
+def mesh_of_block(
+    scene: Field, evidence: Evidence, low: np.ndarray, high: np.ndarray, voxel: float, level_set: float
+) -> BlockMesh | None:
+    """The part of the surface in one block, without anything that `extract_mesh` decides by the whole.
+
+    Args:
+        scene: Field to mesh.
+        evidence: What was seen.
+        low: First lattice index (3,) int64.
+        high: Last one.
+        voxel: Lattice spacing [m].
+        level_set: Logit of the surface.
+
+    Returns:
+        None where there is no surface, or it was seen from behind only.
+
+    Raises:
+        MeshError: The field is not finite.
+    """
+    visible = evidence.visible(low * voxel, high * voxel)
+    if not len(visible):
+        return None
+    surface, x, y, z = Surface(low, high, voxel), *(int(n) for n in high - low + 1)
+    _mesh_block(scene, _Block(low, (x, y, z), visible, None), evidence, surface, voxel, level_set, _Found())
+    vertices, faces, _ = surface.merged()
+    if not len(faces):
+        return None
+    normals = vertex_normals(vertices, faces)
+    facing = evidence.facing(vertices, normals, -_FACING_MARGIN * evidence.behind)[faces].any(axis=1)
+    if not facing.any():
+        return None
+    vertices, faces = keep_faces(vertices, faces, facing)
+    return BlockMesh(vertices, faces, _query_colors(scene, vertices))
+
+
 def _front_faces(vertices: np.ndarray, faces: np.ndarray, evidence: Evidence) -> np.ndarray:
     """The faces that some view sees from the front; raises `MeshError` if there is none."""
     # Half the margin: across a rounded solid, views see some of the far inside within the whole of it.

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from warpslam.runtime.compilation import ModuleProgress
     from warpslam.sequences.base import RgbdSequence
 
+_DIGITS = (4, 5, 4, 6, 6)  # of inliers, depth error, correlation and the two deviations in frames.csv
+
 
 def figures_of_every_run(record: RunRecord, selected_count: int, modules: Sequence[ModuleProgress]) -> dict[str, Any]:
     """Fields of metrics.json that follow from the record, and those about the machine and the software."""
@@ -98,7 +100,7 @@ def write_frames(folder: RunFolder, record: RunRecord) -> None:
         columns = ["inliers", "depth_error_m", "correlation", "sigma_m", "sigma_deg"]
         writer.writerow(["frame", "timestamp", "status", *columns, "message"])
         for index, result in record.frames:
-            figures = [f"{result.inliers:.4f}", f"{result.depth_error:.5f}"]
-            figures.append("" if result.correlation is None else f"{result.correlation:.4f}")
-            figures += ["" if math.isnan(value) else f"{value:.6f}" for value in result.sigma]
+            correlation = math.nan if result.correlation is None else result.correlation
+            measured = zip((result.inliers, result.depth_error, correlation, *result.sigma), _DIGITS, strict=True)
+            figures = ["" if math.isnan(value) else f"{value:.{digits}f}" for value, digits in measured]
             writer.writerow([index, f"{result.timestamp:.6f}", result.status, *figures, result.message])

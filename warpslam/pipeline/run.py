@@ -20,6 +20,7 @@ from warpslam.errors import (
     WarpSlamError,
 )
 from warpslam.pipeline.checkpoints import Checkpoints, SavedRun, find_checkpoint
+from warpslam.pipeline.forecast import Forecast
 from warpslam.pipeline.log import log_file
 from warpslam.pipeline.loop import FrameLoop
 from warpslam.pipeline.methods import has_checkpoints
@@ -324,6 +325,7 @@ class Run:
             else:
                 self.slam = build_slam(camera, self.config, request.device, request.seed, request.method, timing)
         self.record.seconds["kernel_compile"] += self.slam.compile_seconds
+        self.observer.ready(self.slam, self.sequence)
 
     def _process_frames(self) -> None:
         assert self.slam is not None
@@ -337,6 +339,7 @@ class Run:
             world_is_known=self.request.map is None,
             checkpoints=self.checkpoints,
             observer=self.observer,
+            forecast=self._forecast(),
         )
         try:
             with self.record.clock("frames"):
@@ -345,8 +348,14 @@ class Run:
             if self.sequence.is_live:
                 self.selected = range(self.record.position)
 
+    def _forecast(self) -> Forecast:
+        assert self.slam is not None
+        count, evaluates = len(self.selected), self.truth_mesh is not None
+        return Forecast(self.config, self.sequence, self.slam, count, evaluates=evaluates)
+
     def _finish_map(self) -> None:
         assert self.slam is not None
+        self.observer.stage("refining the map")
         with self.record.clock("finish"):
             phases = self.slam.finish()
         for phase, seconds in phases.items():
@@ -357,6 +366,8 @@ class Run:
         assert self.slam is not None
         folder, slam, record, metrics = self.folder, self.slam, self.record, self.metrics
         trajectory = trajectory_of(slam, record)
+        stage = self.observer.stage
+        stage("saving")
         self._attempt(lambda: write_trajectory(folder, trajectory, record))
         self.ate = evaluate_trajectory(trajectory, record, metrics)
         self._attempt(lambda: self._write_figures(UNFINISHED))  # `warpslam report` goes by them if the rest never comes
@@ -366,11 +377,15 @@ class Run:
             metrics.fill({"mesh": {"error": "mapping.enabled is off"}})
             self._attempt(lambda: draw_plots(folder, trajectory, self.ate, record))
         else:
+            stage("extracting the mesh")
             self._attempt(lambda: extract_and_write_mesh(folder, slam, record, metrics))
+            if self.truth_mesh is not None:
+                stage("comparing the mesh with the true surface")
             self.reconstruction = evaluate_reconstruction(
                 folder, self.truth_mesh, self.sequence, trajectory, record, metrics, self.request.device
             )
             self._attempt(lambda: draw_plots(folder, trajectory, self.ate, record))
+            stage("rendering pictures")
             self._attempt(lambda: draw_panels(folder, slam, self.sequence, trajectory, record, metrics))
         if self._unwritten is not None:
             raise self._unwritten
@@ -398,6 +413,7 @@ class Run:
         """All that is written however the run ended: figures, what became of each frame, and the report."""
         try:
             self._write_figures()
+            self.observer.stage("writing the report")
             self._write_report()
         except OSError as error:
             if self.status != FAILED:

@@ -12,6 +12,15 @@ import numpy as np
 from warpslam.errors import DatasetError
 from warpslam.storage.atomic import replacing
 
+PANEL_COUNT = 4
+"""Frames of a run that are shown beside what its map renders."""
+_WIDTH = 240  # [px], at most: small images tell as much in the figure, and rendering is slow without a GPU
+
+
+def panel_stride(width: int) -> int:
+    """Every so many pixels of images that are ``width`` wide are rendered for a panel."""
+    return -(-width // _WIDTH)
+
 
 @dataclass(frozen=True)
 class Panel:

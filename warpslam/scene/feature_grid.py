@@ -82,6 +82,16 @@ class FeatureGrid:
             record_tape=False,
         )
 
+    def renew(self, rows: np.ndarray) -> None:
+        """Some rows, int (n,), become again what a new vertex is; `seen` says so, too."""
+        fresh = FeatureGrid(self.level, self.spacing, self.std, self.seed, self.device)
+        fresh._resize(self.first, self.shape)
+        fresh.seen = self.seen
+        seen = self.seen.numpy().copy()
+        seen[rows] = 0
+        self.seen.assign(seen)
+        self.update_from(fresh, wp.array(rows.astype(np.int32), dtype=int, device=self.device))
+
     def state(self) -> GridState:
         """The grid as arrays; on the CPU they are its own, not copies."""
         features, seen = (array.numpy()[: self.row_count] for array in (self.features, self.seen))
