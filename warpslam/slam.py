@@ -344,6 +344,8 @@ class Slam:
 
     def _track(self, frame: AdmittedFrame) -> Located:
         if self.direct is not None:
+            estimator = self.timing_estimator
+            self.direct.is_timing_open = estimator is not None and estimator.is_open
             return self.direct.locate(frame, self.history, None if self.scene.is_empty else self.scene.arrays())
         self.images.rectify_current(self._motion(frame))
         return self.localizer.locate(self.scene.arrays(), self.images, frame.index, self.history, self.keyframes)

@@ -294,6 +294,8 @@ class DirectTracker:
         self._rivals: list[Attempt] = []
         self._rotations = rotation_grid(config.search_span)
         self._second = SecondWitness(camera, device, max_depth, keyframes, images)
+        self.is_timing_open = False
+        """Whether the camera's timing is being estimated: depth of features, at a wrong time, would disturb that."""
         self.fixed = 0
         """Keyframes, the first ones, whose poses stay as they are: those of a map that is only looked at."""
         self.counts = {"sure": 0, "searched": 0}
@@ -976,7 +978,7 @@ class DirectTracker:
             self.config.grey_weight,
             self.config.depth_weight,
             self.config.window_iterations,
-            self._features_between(active) if self.config.window_features else None,
+            self._features_between(active) if self.config.window_features and not self.is_timing_open else None,
         )
         self.move_keyframes(dict(zip(active, refined.poses, strict=True)), history)
         for (i, j), H in refined.information.items():
