@@ -504,7 +504,7 @@ def engine_calls(engine: Any, index: int, frame: Any) -> dict[str, tuple[Callabl
 
     images, pose = engine.images, engine.history.pose(index)
     return {
-        "mapping call ms": (lambda: engine.mapper.map_frame(images, index, pose, engine.keyframes), 3),
+        "mapping call ms": (lambda: engine.mapper.start_frame(images, index, pose, engine.keyframes)(), 3),
         "track ms": (lambda: engine.tracker.track(engine.scene.arrays(), images, index, frame.T_world_camera), 10),
         "set image ms": (lambda: images.set(0, frame.rgb, frame.depth), 10),
         "keyframe image ms": (images.keep_current, 3),

@@ -93,7 +93,7 @@ def convergence(job: Job) -> dict[str, Any]:
         curve.append([iteration + 1, error])
 
     note(None, -1, mapping.first_iterations)
-    mapper.map_first(images, 0, orthonormalized(T_world_camera), note)
+    mapper.start_first(images, 0, orthonormalized(T_world_camera), note)()
     return {"figures": {"view_depth": curve[-1][1]}, "curve": curve}
 
 

@@ -21,12 +21,11 @@ from warpslam.camera import Intrinsics
 from warpslam.kernels.direct import registration
 from warpslam.poses import inverse, motion_between, orthonormalized
 from warpslam.scene.image_pool import ImagePool
-from warpslam.tracking.direct.aliases import difference_elsewhere
 from warpslam.tracking.direct.measures import Measures
 from warpslam.tracking.direct.pyramid import records
 from warpslam.tracking.direct.registrar import new_tasks
 from warpslam.tracking.direct.second import Picture
-from warpslam.tracking.direct.tracker import MAX_SIGMA, SAME_STEP, SCRATCH, TELLING, DirectTracker, covariance_of
+from warpslam.tracking.direct.tracker import MAX_SIGMA, TELLING, DirectTracker, covariance_of
 from warpslam.tracking.direct.window import Pose, refine_window
 from warpslam.tracking.features.detection import DEPTH_STRIDE, FeatureFrame, detect
 from warpslam.tracking.features.pairs import descriptor_pairs
@@ -145,10 +144,7 @@ class Verifier:
             seen, empty = depth_consistency(one, other, T_other_one, camera, max_depth)
             if seen < LEAST_SEEN or empty > MOST_EMPTY:
                 return Verdict(Gate.DEPTH, f"{seen:.0%} measured by both, {empty:.1%} of it where one saw nothing", T)
-        weights = self.tracker.config.grey_weight, self.tracker.config.depth_weight
-        elsewhere = difference_elsewhere(
-            self.tracker.registrar, self.tracker.keyframe_row(b), SCRATCH, weights, SAME_STEP
-        )
+        elsewhere = self.tracker.difference_elsewhere(self.tracker.keyframe_row(b))
         if elsewhere < TELLING:
             return Verdict(Gate.UNIQUE, f"the frame differs from itself elsewhere by only {elsewhere:.2f}", T)
         return registered

@@ -98,30 +98,19 @@ class DirectMapper:
 
     # -- as `Mapper` ---------------------------------------------------------------------------------------------
 
-    def map_first(
-        self, images: ImagePool, frame: int, pose: np.ndarray, on_iteration: Callable | None = None
-    ) -> MappingResult:
-        """The first frame: more iterations."""
-        return self.start_first(images, frame, pose, on_iteration)()
-
-    def map_frame(self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
-        """A later frame."""
-        return self.start_frame(images, frame, pose, keyframes)()
-
     def start_first(
         self, images: ImagePool, frame: int, pose: np.ndarray, on_iteration: Callable | None = None
     ) -> Callable[[], MappingResult]:
-        """`map_first` without waiting for the device: the function that is returned waits, and reads the outcome."""
+        """The first frame: more iterations. What is returned waits for the device, and reads the outcome."""
         return self._optimize(images, frame, pose, [], self.config.first_iterations, on_iteration=on_iteration)
 
     def start_frame(
         self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe]
     ) -> Callable[[], MappingResult]:
-        """`map_frame` without waiting for the device: the function that is returned waits, and reads the outcome."""
-        rng = np.random.default_rng([self.seed, 2, frame, 0])
-        count = round(PARTS * self.supervision.replay_share)
-        replayed = replayed_keyframes(keyframes, count, rng, images, pose, self.camera)
-        return self._optimize(images, frame, pose, replayed, self.config.iterations)
+        """A later frame. What is returned waits for the device, and reads the outcome."""
+        return self._optimize(
+            images, frame, pose, self._replayed(images, frame, pose, keyframes, 0), self.config.iterations
+        )
 
     def refine(
         self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe], rounds: range
@@ -151,10 +140,9 @@ class DirectMapper:
         self, images: ImagePool, keyframe: Keyframe, keyframes: list[Keyframe], iterations: int, round_: int
     ) -> MappingResult:
         """Map a keyframe, whose image is in slot 0, together with others that see the same."""
-        rng = np.random.default_rng([self.seed, 2, keyframe.index, round_])
-        count = round(PARTS * self.supervision.replay_share)
-        replayed = replayed_keyframes(keyframes, count, rng, images, keyframe.pose, self.camera)
-        return self._optimize(images, keyframe.index, keyframe.pose, replayed, iterations, round_=round_)()
+        frame, pose = keyframe.index, keyframe.pose
+        replayed = self._replayed(images, frame, pose, keyframes, round_)
+        return self._optimize(images, frame, pose, replayed, iterations, round_=round_)()
 
     def changed_rows(self) -> dict[str, wp.array]:
         """Rows of each level that the last call may have changed, int (n,); levels it left alone are absent."""
@@ -174,6 +162,14 @@ class DirectMapper:
                 rows.restore(state[level])
         if "decoder" in state:
             self._decoder.restore(state["decoder"])
+
+    def _replayed(
+        self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe], round_: int
+    ) -> list[Keyframe]:
+        """Keyframes that share a call with a frame."""
+        rng = np.random.default_rng([self.seed, 2, frame, round_])
+        count = round(PARTS * self.supervision.replay_share)
+        return replayed_keyframes(keyframes, count, rng, images, pose, self.camera)
 
     # -- one call ------------------------------------------------------------------------------------------------
 

@@ -122,20 +122,12 @@ class Mapper:
         wanted = {"middle": config.optimize_middle, "fine": config.optimize_fine}
         self._frozen = {level for level, is_optimized in wanted.items() if not is_optimized}
 
-    def map_first(
-        self, images: ImagePool, frame: int, pose: np.ndarray, on_iteration: Callable | None = None
-    ) -> MappingResult:
-        """The first frame: many iterations at higher rates."""
-        return self.start_first(images, frame, pose, on_iteration)()
-
-    def map_frame(self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
-        """A later frame: window, frustum selection, three stages, bundle adjustment once there are enough keyframes."""
-        return self.start_frame(images, frame, pose, keyframes)()
-
     def start_first(
         self, images: ImagePool, frame: int, pose: np.ndarray, on_iteration: Callable | None = None
     ) -> Callable[[], MappingResult]:
-        """`map_first` without waiting for the device: the function that is returned waits, and reads the outcome."""
+        """The first frame: many iterations at higher rates. What is returned waits for the device, and reads the
+        outcome.
+        """
         config = self.config
         return self._optimize(
             images, frame, pose, [], config.first_iterations, config.first_rate_factor, on_iteration=on_iteration
@@ -144,7 +136,9 @@ class Mapper:
     def start_frame(
         self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe]
     ) -> Callable[[], MappingResult]:
-        """`map_frame` without waiting for the device: the function that is returned waits, and reads the outcome."""
+        """A later frame: window, frustum selection, three stages, bundle adjustment once there are enough keyframes.
+        What is returned waits for the device, and reads the outcome.
+        """
         return self._optimize(images, frame, pose, keyframes, self.config.iterations, 1.0)
 
     def refine(

@@ -29,8 +29,10 @@ from warpslam.scene.keyframes import Keyframe
 from warpslam.tracking.direct.aliases import difference_elsewhere
 from warpslam.tracking.direct.joint_rows import (
     LINEARIZATIONS,
+    SAME_STEP,
     WEAK_SIGMA,
     feature_rows,
+    is_elsewhere,
     is_far,
     pair_rows,
     weakest_sigma,
@@ -54,8 +56,6 @@ NEAR_KEYFRAMES = MOST_NEAR
 """Keyframes, the nearest by pose, whose overlap is looked at."""
 DEGREE = 0.02
 """Metres that a degree counts for when keyframes are ordered by nearness."""
-SAME_STEP, SAME_TURN = 0.1, 5.0
-"""Poses further apart [m], [degrees] are two places; the joint registration must not take a frame to another."""
 BRIDGE = 5
 """Frames without a pose over which constant speed is still believed."""
 MAX_GAP = 10
@@ -463,7 +463,7 @@ class DirectTracker:
         """Whether the frame may be at another place as well."""
         for other in self._rivals:
             is_alike = other.measures.agreement > FOUND_AGREEMENT and other.cost < UNIQUE * attempt.cost
-            if is_alike and _is_elsewhere(pose, self._pose_of(other)):
+            if is_alike and is_elsewhere(pose, self._pose_of(other)):
                 return True
         return self._is_untold(row, pose)
 
@@ -471,8 +471,7 @@ class DirectTracker:
         """Whether a frame does not tell where it is, and did not go on as it did, no period of the surface further."""
         if self._foretold is not None and motion_between(self._foretold, pose)[0] < SAME_STEP:
             return False
-        weights = self.config.grey_weight, self.config.depth_weight
-        return difference_elsewhere(self.registrar, row, SCRATCH, weights, SAME_STEP) < TELLING
+        return self.difference_elsewhere(row) < TELLING
 
     # -- registration --------------------------------------------------------------------------------------------
 
@@ -534,7 +533,7 @@ class DirectTracker:
                 attempt, cost=best.cost, measures=best.measures, grey_scale=best.grey_scale, moved=best.moved
             )
         T, T_joint, back = np.asarray(result["T"], np.float64), np.asarray(last["T"], np.float64), found.back
-        if _is_elsewhere(T_joint, T):
+        if is_elsewhere(T_joint, T):
             pair = self._pair_back(reference)
             T_joint, pair["T"] = T, inverse(T)
             back = self.registrar.pairs(self.plan.middle, pair, self.config.grey_weight, self.config.depth_weight)[0]
@@ -882,8 +881,8 @@ class DirectTracker:
             return best
         place = self._pose_of(best)
         for other in found:
-            is_elsewhere = _is_elsewhere(place, self._pose_of(other))
-            if is_elsewhere and self._is_good(other) and other.cost < UNIQUE * best.cost:
+            is_rival = is_elsewhere(place, self._pose_of(other))
+            if is_rival and self._is_good(other) and other.cost < UNIQUE * best.cost:
                 return replace(best, ok=False)
         return best
 
@@ -1038,6 +1037,13 @@ class DirectTracker:
     def keyframe_row(self, number: int) -> int:
         """Row of a keyframe's images, built if they are gone; it holds until `CACHED` others were asked for."""
         return self._row(self.keyframes[number])
+
+    def difference_elsewhere(self, row: int) -> float:
+        """How much images differ from themselves at another place, see `aliases.difference_elsewhere`; below `TELLING`
+        they do not tell where they are.
+        """
+        weights = self.config.grey_weight, self.config.depth_weight
+        return difference_elsewhere(self.registrar, row, SCRATCH, weights, SAME_STEP)
 
     @property
     def is_confirming(self) -> bool:
@@ -1272,12 +1278,6 @@ def _better(a: Attempt | None, b: Attempt | None, *, by_cost: bool = False) -> A
     if by_cost:
         return b if b.cost < a.cost else a
     return b if b.measures.worth > a.measures.worth else a
-
-
-def _is_elsewhere(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two poses are two places."""
-    step, turn = motion_between(a, b)
-    return bool(step > SAME_STEP or turn > SAME_TURN)
 
 
 def _running(mean: float, value: float) -> float:
