@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
@@ -209,6 +210,24 @@ def test_first_signal_while_results_are_written_waits_for_them(fake_slam, ctrl_c
     folder = result.folder
     assert result.status == metrics_of(tmp_path)["status"] == "interrupted"
     assert all(path.is_file() for path in (folder.trajectory, folder.map, folder.mesh, folder.panels, folder.report))
+
+
+def test_a_signal_that_was_swallowed_ends_the_run_at_the_next_frame(fake_slam, tmp_path, monkeypatch):
+    """As imports do that catch everything. What is done by then is written, and the next run knows nothing of it."""
+    function, count = fake_slam.step, iter(range(9))
+
+    def deaf(self, *arguments, **keywords):
+        if next(count) == 1:
+            with contextlib.suppress(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(5)
+        return function(self, *arguments, **keywords)
+
+    monkeypatch.setattr(fake_slam, "step", deaf)
+    with terminable():
+        result = run_sequence(FakeSequence(4), Config(), tmp_path / "stopped")
+    assert result.status == "interrupted" and metrics_of(tmp_path / "stopped")["frames"]["processed"] == 2
+    assert run_sequence(FakeSequence(4), Config(), tmp_path / "next").status == "finished"
 
 
 def test_second_signal_ends_the_writing(fake_slam, ctrl_c, tmp_path, monkeypatch):

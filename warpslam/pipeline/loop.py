@@ -17,6 +17,7 @@ from warpslam.pipeline.read_ahead import ReadAhead
 from warpslam.pipeline.results import trajectory_of
 from warpslam.runs.metrics import FoundTiming
 from warpslam.runs.record import Progress
+from warpslam.runtime.stopping import raise_if_terminated
 from warpslam.sequences.base import EndOfFrames
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ class FrameLoop:
         """
         self.checkpoints.before_frames(self.record, self.slam)
         for frame in self._readable_frames():
+            raise_if_terminated()
             truth = _true_pose(frame)
             result = self.slam.step(
                 frame.rgb,

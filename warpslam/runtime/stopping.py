@@ -16,11 +16,22 @@ class Terminated(KeyboardInterrupt):
 
 
 _arrived = threading.Event()
+_is_due = threading.Event()  # as long as `terminable` lasts
 
 
 def was_terminated() -> bool:
     """Whether this process has been sent SIGTERM since `terminable` began."""
     return _arrived.is_set()
+
+
+def raise_if_terminated() -> None:
+    """Raise what a SIGTERM has raised already, but where nothing heeds it: many a library's import swallows it.
+
+    Raises:
+        Terminated: The signal has come, and the block of `terminable` goes on.
+    """
+    if _is_due.is_set():
+        raise Terminated
 
 
 @contextmanager
@@ -33,6 +44,7 @@ def terminable() -> Iterator[None]:
 
     def stop(number: int, frame: Any) -> None:
         _arrived.set()
+        _is_due.set()
         raise Terminated
 
     before = signal.signal(signal.SIGTERM, stop)
@@ -40,6 +52,7 @@ def terminable() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+        _is_due.clear()
 
 
 class Deferral:
