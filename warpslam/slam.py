@@ -198,7 +198,7 @@ class Slam:
                 self.wait()
         if self.config.mapping.color_refinement and self.keyframes:
             with account.timed("refinement"):
-                self._refine(index, 0, self.config.mapping.refinement_rounds)
+                self._refine(index, 0, self._refinement_rounds)
         return account.seconds
 
     @exclusive
@@ -206,7 +206,7 @@ class Slam:
         """More rounds of the global refinement that `finish` ends with (Sec. 3.1), on a map that is done.
 
         Args:
-            rounds: `MappingConfig.refinement_rounds` by default. Their random draws are not those of `finish`.
+            rounds: As many as `finish` by default. Their random draws are not those of `finish`.
 
         Raises:
             InputError: There is no keyframe, or the last frame was not OK, so there is no window to refine.
@@ -215,8 +215,8 @@ class Slam:
         config, index = self.config.mapping, self._current
         if index is None or self.history.status(index) is not FrameStatus.OK or not self.keyframes:
             raise InputError("the map can't be refined: it has no keyframe, or its last frame was not OK")
-        done = config.refinement_rounds if config.color_refinement else 0
-        self._refine(index, done, config.refinement_rounds if rounds is None else rounds)
+        usual = self._refinement_rounds
+        self._refine(index, usual if config.color_refinement else 0, usual if rounds is None else rounds)
 
     @exclusive
     def wait(self) -> None:
@@ -480,6 +480,11 @@ class Slam:
         with account.timed("keyframe"):
             image = self.images.keep_current()
             self.keyframes.append(Keyframe(frame.index, image, self.history.pose(frame.index), self.images.motion))
+
+    @property
+    def _refinement_rounds(self) -> int:
+        """Rounds that `finish` has."""
+        return self.config.mapping.rounds_for(len(self.keyframes))
 
     def _refine(self, index: int, first_round: int, rounds: int) -> None:
         which = range(first_round, first_round + rounds)

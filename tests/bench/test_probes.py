@@ -21,7 +21,7 @@ def job(tmp_path_factory) -> Job:
         "mapping.every=1", "mapping.pixels=80", "mapping.first_iterations=20", "mapping.iterations=10",
         "mapping.coarse_iterations=2", "keyframes.every=1", "tracking.ignore_edge_u=2", "tracking.ignore_edge_v=2",
     )  # fmt: skip
-    return Job("room", RunRequest(Source(str(folder)), preset="default", overrides=overrides, device="cpu"))
+    return Job("room", RunRequest(Source(str(folder)), preset="rendering", overrides=overrides, device="cpu"))
 
 
 def test_only_the_frustum_changes(job):

@@ -90,17 +90,19 @@ def test_a_saved_map_goes_on_as_if_it_had_not_been(frames, tmp_path):
 
 
 def test_beside_tracking_the_tracker_gets_the_rows_that_changed(frames):
-    """With the overlapped schedule both maps are the same when all is taken over."""
+    """With the overlapped schedule both maps are the same when all is taken over, and after the final refinement."""
     slam = step(new("schedule=overlapped"), frames[:4])
     slam.wait()
     assert slam.mapper.scene is not slam.scene
-    for level, grid in slam.mapper.scene.grids.items():
-        np.testing.assert_array_equal(grid.features.numpy(), slam.scene.grids[level].features.numpy(), level)
+    for last in (slam.wait, slam.finish):
+        last()
+        for level, grid in slam.mapper.scene.grids.items():
+            np.testing.assert_array_equal(grid.features.numpy(), slam.scene.grids[level].features.numpy(), level)
 
 
 @pytest.mark.parametrize("frozen", ["middle", "fine"])
 def test_a_frozen_level_stays_as_it_began(frames, frozen):
-    """The other levels are optimised, and the coarse one never is."""
+    """The other levels are optimised, and the coarse one waits for the end."""
     slam = step(new(f"mapping.optimize_{frozen}=false"), frames[:2])
     for level, grid in slam.scene.grids.items():
         initial = FeatureGrid(level, grid.spacing, grid.std, slam.seed, slam.device)

@@ -21,7 +21,7 @@ SETTINGS = [
 def mapped(*overrides: str) -> Slam:
     """Three frames, mapped and refined."""
     sequence = SyntheticSequence(1, 3, intrinsics=CAMERA)
-    slam = Slam(CAMERA, Config.from_preset("default", [*SETTINGS, *overrides]), "cpu")
+    slam = Slam(CAMERA, Config.from_preset("rendering", [*SETTINGS, *overrides]), "cpu")
     for frame in sequence:
         slam.step(frame.rgb, frame.depth, frame.timestamp, frame.T_world_camera)
     slam.finish()
@@ -49,7 +49,7 @@ def test_no_iteration_is_spent_on_a_frozen_middle_level():
     """The middle stage has nothing to optimise then, and becomes part of the fine one."""
 
     def stages(*overrides: str) -> list[str]:
-        return Slam(CAMERA, Config.from_preset("default", overrides), "cpu").mapper._schedule(10, refinement=False)
+        return Slam(CAMERA, Config.from_preset("rendering", overrides), "cpu").mapper._schedule(10, refinement=False)
 
     assert stages() == ["middle"] * 5 + ["fine"] * 2 + ["color"] * 3
     assert stages("mapping.optimize_middle=false") == ["fine"] * 7 + ["color"] * 3
@@ -71,7 +71,7 @@ def test_what_has_moved_away_leaves_the_map():
             "mapping.every=1", "mapping.first_iterations=60", "mapping.iterations=25", "mapping.pixels=300",
             "keyframes.every=1", "mapping.coarse=false", "tracking.use_given_poses=true",
         ]  # fmt: skip
-        slam = Slam(CAMERA, Config.from_preset("default", [*settings, *overrides]), "cpu")
+        slam = Slam(CAMERA, Config.from_preset("rendering", [*settings, *overrides]), "cpu")
         for n, depth in enumerate([with_box] * 3 + [wall] * 3):
             slam.step(rgb, depth, float(n), np.eye(4))
         return float(np.abs(slam.render(np.eye(4)).depth - wall)[box].mean())

@@ -23,7 +23,7 @@ def test_settings_come_from_a_preset_or_a_config():
     base = Config.from_preset("thorough", ["mapping.iterations=7"])
     request = RunRequest(config=base, overrides=OVERRIDES, decoders="d.pth", poses="p.tum")
     settings = request.settings("replica")
-    assert (settings.mapping.iterations, settings.mapping.every, settings.mapping.window) == (7, 2, 3)
+    assert (settings.mapping.iterations, settings.mapping.every, settings.mapping.window) == (7, 1, 3)
     assert settings.decoders == "d.pth" and settings.tracking.use_given_poses
     assert base.mapping.window != 3, "the request's own stays as it is"
     with pytest.raises(ConfigError, match="do not go together"):

@@ -49,7 +49,7 @@ def optimizer(request) -> str:
 def saved(sequence, optimizer, tmp_path_factory):
     """A map of the first frames, in a file."""
     settings = [*SETTINGS, f"tracking.optimizer={optimizer}"]
-    slam = Slam(CAMERA, Config.from_preset("default", settings), "cpu", decoders=load_decoders())
+    slam = Slam(CAMERA, Config.from_preset("rendering", settings), "cpu", decoders=load_decoders())
     for n in range(BEFORE):
         frame = sequence[STRIDE * n]
         result = slam.step(frame.rgb, frame.depth, frame.timestamp, frame.T_world_camera if n == 0 else None)

@@ -51,7 +51,7 @@ class Ours:
         self.frames = [sequence[SPACING * i] for i in range(6)]
         self.poses = sequence.ground_truth()[: 6 * SPACING : SPACING]
         first = ["mapping.first_iterations=200", "mapping.every=1000"]
-        self.slam = Slam(CAMERA, Config.from_preset("default", [*PAPER, *first, *overrides]), device=None)
+        self.slam = Slam(CAMERA, Config.from_preset("rendering", [*PAPER, *first, *overrides]), device=None)
         for frame in self.frames[:5]:
             self.slam.step(frame.rgb, frame.depth, T_world_camera=frame.T_world_camera)
         last = self.frames[5]

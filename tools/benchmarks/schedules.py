@@ -23,7 +23,7 @@ from warpslam.evaluation import ate
 from warpslam.field.decoder_files import load_decoders
 from warpslam.sequences.base import Frame
 from warpslam.slam import Slam
-from warpslam.synthetic.demo import INTRINSICS, OVERRIDES, PRESET, demo_sequence
+from warpslam.synthetic.demo import INTRINSICS, PRESET, demo_sequence
 
 SCHEDULES = ("strict", "overlapped")
 
@@ -73,7 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--set", action="append", default=[], metavar="GROUP.FIELD=VALUE", help="a setting")
     options = parser.parse_args(arguments)
     try:
-        configs = {s: Config.from_preset(PRESET, [*OVERRIDES, *options.set, f"schedule={s}"]) for s in SCHEDULES}
+        configs = {s: Config.from_preset(PRESET, [*options.set, f"schedule={s}"]) for s in SCHEDULES}
         sequence = demo_sequence()
         frames = [sequence[n] for n in range(min(options.frames, len(sequence)))]
         print("| schedule | frames/s | mean [ms] | median [ms] | 95 % [ms] | max [ms] | ATE [cm] |")

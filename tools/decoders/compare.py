@@ -149,7 +149,7 @@ def _map_frames(
     sequence: RgbdSequence, frames: range, weights: Decoders, overrides: list[str], *, finish: bool = True
 ) -> Slam:
     fixed = ["tracking.use_given_poses=true", "mapping.every=1", "mapping.bundle_adjustment=false", "keyframes.every=2"]
-    config = Config.from_preset("default", [*fixed, *overrides])
+    config = Config.from_preset("rendering", [*fixed, *overrides])
     slam = Slam(sequence.intrinsics, config, decoders=weights)
     for index in frames:
         frame = sequence[index]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
@@ -129,7 +130,7 @@ class Suite:
         if path is None:
             return None
         places = [(base / Path(path).expanduser()).resolve() for base in self.bases]
-        return str(next((place for place in places if place.exists()), places[0]))
+        return str(next((place for place in places if os.path.exists(place)), places[0]))
 
 
 def read_suite(name: str, *data: str | Path) -> Suite:
@@ -143,7 +144,7 @@ def read_suite(name: str, *data: str | Path) -> Suite:
         ConfigError: There is no such suite, it can't be read, or a field is unknown or has a value that does not fit.
     """
     path = Path(name)
-    if not path.is_file() and name in SHIPPED:
+    if not os.path.isfile(path) and name in SHIPPED:
         text = resources.files("warpslam.bench").joinpath("suites", f"{name}.yaml").read_text(encoding="utf-8")
         own, source, where = Path("."), "shipped", f"suite {name}"
     else:

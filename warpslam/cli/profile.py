@@ -38,7 +38,7 @@ def add(commands: Any) -> None:
 def _profile(options: argparse.Namespace) -> int:
     quiet_warp()
     for option, file in (("--json", options.json), ("--trace", options.trace)):
-        if file and not Path(file).resolve().parent.is_dir():
+        if file and not os.path.isdir(Path(file).resolve().parent):
             raise ConfigError(f"{option} {file}: there is no folder {Path(file).resolve().parent}; make it first")
     sequence, config = _input(options)
     if options.decoders:
@@ -64,8 +64,7 @@ def _profile(options: argparse.Namespace) -> int:
 
 def _input(options: argparse.Namespace) -> tuple[RgbdSequence, Config]:
     if options.folder == "demo":
-        preset, overrides = options.preset or demo.PRESET, [*demo.OVERRIDES, *options.overrides]
-        return open_source(Source.demo()), Config.from_preset(preset, overrides)
+        return open_source(Source.demo()), Config.from_preset(options.preset or demo.PRESET, options.overrides)
     source = Source(
         os.path.abspath(Path(options.folder).expanduser()), options.dataset, options.camera, topics=options.topics
     )

@@ -101,7 +101,7 @@ def _run(options: argparse.Namespace) -> int:
         if options.preset or options.config or options.decoders:
             raise ConfigError("--preset, --config and --decoders do not go with --map, which has all three; use --set")
         path = Path(map_).expanduser().resolve()
-        map_ = str(RunFolder(path).map if path.is_dir() else path)
+        map_ = str(RunFolder(path).map if os.path.isdir(path) else path)
     folder = os.path.abspath(Path(options.folder).expanduser())  # a link keeps its name, which may tell the camera
     request = replace(
         _common(options),
@@ -122,7 +122,6 @@ def _demo(options: argparse.Namespace) -> int:
         request,
         source=Source.demo(options.command_line),
         preset=demo.PRESET,
-        overrides=(*demo.OVERRIDES, *request.overrides),
     )
     return _execute(request, options)
 

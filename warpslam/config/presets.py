@@ -5,14 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 # "paper_*" hold the released configurations (rotation_rate_factor 0.2 = "separate rates") with the paper's optimiser.
-# The others are
-# ours: direct tracking, and work cut to what two CPU cores do in minutes; BENCHMARK.md has what they reach.
+# The others are ours: direct tracking and the direct loss; BENCHMARK.md has what they reach.
+_RENDERING: dict[str, Any] = {
+    "loss": "rendering", "iterations": 60, "refinement_rounds": 5, "refinement_iterations": None,
+}  # fmt: skip
 _PAPER: dict[str, Any] = {"optimizer": "adam", "final_rate_factor": 1.0, "seen_only": False}
 
 
 def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, Any]:
     mapping = {
-        "first_iterations": 1500, "active_share": 0.0, "depth_start": False, "bundle_adjustment_filter": 0.0,
+        **_RENDERING, "first_iterations": 1500, "active_share": 0.0, "depth_start": False,
+        "bundle_adjustment_filter": 0.0,
         **groups.pop("mapping", {}),
     }  # fmt: skip
     return {
@@ -20,30 +23,32 @@ def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, A
         "tracking": {**_PAPER, **(tracking or {})},
         "mapping": mapping,
         "keyframes": {"every": 50},
-        "meshing": {"level_set": 0.0},
         "sensor_timing": False,
         "published_images": True,
+        "grid": _PAPER_GRID,
         **groups,
     }
 
 
+_PAPER_GRID = {"fine_spacing": 0.16}
 _TUM_GRID = {"middle_spacing": 0.16, "fine_spacing": 0.08, "color_spacing": 0.08}
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
-    "live": {
-        "grid": {"fine_spacing": 0.08},
-        "mapping": {"loss": "direct", "every": 1, "pixels": 800, "iterations": 3, "first_iterations": 60},
-        "meshing": {"level_set": 0.0},
+    "live": {"mapping": {"every": 1, "iterations": 3}},
+    "thorough": {"mapping": {"every": 1, "iterations": 15, "refinement_rounds": 6}},
+    "rendering": {
+        "grid": _PAPER_GRID,
+        "mapping": {**_RENDERING, "first_iterations": 500},
+        "meshing": {"level_set": -0.1},
     },
-    "thorough": {"mapping": {"every": 2, "iterations": 90}},
     "replica": {"tracking": {"ignore_edge_u": 100, "ignore_edge_v": 100}},
     "scannet": {},
     "apartment": {},
     "own": {},
     "seven_scenes": {},
     "cofusion": {"mapping": {"bundle_adjustment_rate": 0.0, "moved_margin": 0.1}},
-    "icl": {"mapping": {"every": 2}},
-    "tum_rgbd": {"grid": _TUM_GRID},
+    "icl": {},
+    "tum_rgbd": {},
     "paper_replica": _paper({"pixels": 200, "iterations": 10, "ignore_edge_u": 100, "ignore_edge_v": 100}),
     "paper_scannet": _paper(
         {"learning_rate": 5e-4, "pixels": 1000, "iterations": 50}, mapping={"pixels": 5000, "window": 10}
@@ -57,6 +62,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         grid=_TUM_GRID,
     ),
     "paper_imap": {
+        "grid": _PAPER_GRID,
+        "mapping": {**_RENDERING, "first_iterations": 500},
+        "meshing": {"level_set": -0.1},
         "sensor_timing": False,
         "published_images": True,
         "sampling": {"jitter": False},

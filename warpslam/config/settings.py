@@ -32,7 +32,7 @@ class GridConfig(_Group):
 
     coarse_spacing: float = Field(2.0, gt=0, description="vertex spacing of the coarse level [m]")
     middle_spacing: float = Field(0.32, gt=0, description="vertex spacing of the middle level [m]")
-    fine_spacing: float = Field(0.16, gt=0, description="vertex spacing of the fine level [m]")
+    fine_spacing: float = Field(0.08, gt=0, description="vertex spacing of the fine level [m]")
     color_spacing: float = Field(0.16, gt=0, description="vertex spacing of the colour grid [m]")
     coarse_std: float = Field(0.01, ge=0, description="standard deviation of the initial coarse features")
     middle_std: float = Field(0.01, ge=0, description="standard deviation of the initial middle features")
@@ -139,8 +139,8 @@ class MappingConfig(_Group):
     selection: Literal["overlap", "global"] = Field(
         "overlap", description="keyframes of the window by overlap or at random"
     )
-    first_iterations: int = Field(500, ge=1, description="iterations on the first frame; the paper's code has 1500")
-    iterations: int = Field(60, ge=1, description="iterations on later frames")
+    first_iterations: int = Field(60, ge=1, description="iterations on the first frame; the paper's code has 1500")
+    iterations: int = Field(15, ge=1, description="iterations on later frames; the paper's code has 60")
     middle_share: float = Field(0.4, ge=0, le=1, description="share of iterations after which the fine stage starts")
     fine_share: float = Field(0.6, ge=0, le=1, description="share of iterations after which the colour stage starts")
     middle_rate: float = Field(0.1, gt=0, description="learning rate of middle features in the middle stage")
@@ -154,9 +154,9 @@ class MappingConfig(_Group):
     )
     color_weight: float = Field(0.2, ge=0, description="lambda_p of Eq. 10")
     loss: Literal["direct", "rendering"] = Field(
-        "rendering",
-        description="direct: every sample against the measured depth (group supervision); rendering: depth and colour "
-        "of whole rays (paper)",
+        "direct",
+        description="direct: every sample against the measured depth (group supervision), and whole rays in the final "
+        "refinement; rendering: depth and colour of whole rays (paper)",
     )
     loss_reduction: Literal["sum", "mean"] = Field(
         "sum", description="of the rendering loss: sums over rays (released code) or means (Eq. 8-9)"
@@ -191,7 +191,30 @@ class MappingConfig(_Group):
     )
     bundle_adjustment_keyframes: int = Field(5, ge=2, description="keyframes needed before poses are refined")
     color_refinement: bool = Field(True, description="refine the whole map after the last frame")
-    refinement_rounds: int = Field(5, ge=1, description="rounds of `iterations` in the final refinement")
+    refinement_rounds: int = Field(
+        2,
+        ge=1,
+        description="rounds of the final refinement; more with the direct loss where keyframes would be left out",
+    )
+    refinement_iterations: int | None = Field(
+        60, ge=1, description="iterations of such a round; empty = as many as `iterations`"
+    )
+
+    @property
+    def refinement_frames(self) -> int:
+        """Frames of a round of the final refinement, the last one included."""
+        return 2 * self.window
+
+    @property
+    def refined_directly(self) -> int:
+        """Iterations of the direct loss in such a round, where that is the loss, beside those of the rendering loss."""
+        return round(0.7 * (self.refinement_iterations or self.iterations))
+
+    def rounds_for(self, keyframe_count: int) -> int:
+        """Rounds of the final refinement: with the direct loss so many that every keyframe takes part."""
+        if self.loss == "rendering":
+            return self.refinement_rounds
+        return max(self.refinement_rounds, -(-keyframe_count // max(self.refinement_frames - 1, 1)))
 
 
 class SupervisionConfig(_Group):
@@ -320,9 +343,9 @@ class MeshingConfig(_Group):
 
     voxel: float = Field(0.02, gt=0, description="edge of a marching-cubes cell [m]")
     level_set: float = Field(
-        -0.1,
-        description="logit of the surface; 0 (occupancy 1/2, the paper) is more accurate where the map is well formed, "
-        "and loses what was mapped for a short time",
+        0.0,
+        description="logit of the surface: 0 = occupancy 1/2 (paper); below that a map of few iterations of the "
+        "rendering loss loses less of what was mapped for a short time",
     )
     min_component_area: float = Field(
         0.2, ge=0, description="smaller loose pieces are dropped [m^2], unless measured depth confirms them"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import warnings
 import zipfile
 from collections.abc import Mapping
@@ -64,7 +65,7 @@ def load_decoders(
             raise CheckpointError(f"The authors' weights come as a pair of files; `{missing}` is not given.")
         return _load_pair(Path(coarse), Path(middle_fine), color_seed)
     path = DEFAULT_PATH if path is None else Path(path)
-    if path.is_dir():
+    if os.path.isdir(path):  # whatever the path
         return _load_pair(path / "coarse.pt", path / "middle_fine.pt", color_seed)
     state = _find_state(_read_checkpoint(path), path)
     return Decoders(*(_collect(state, f"{level}_decoder.", level, path) for level in LEVELS))
@@ -164,7 +165,7 @@ def _to_array(value: Any, shape: tuple[int, ...], key: str, path: Path) -> np.nd
 
 def _read_checkpoint(path: Path) -> Mapping[str, Any]:
     """Load a checkpoint without running code from it."""
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise CheckpointError(
             f"{path}: there is no such file. Give the path of a decoder checkpoint (.pth or .pt), or of a folder that "
             "holds coarse.pt and middle_fine.pt."

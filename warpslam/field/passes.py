@@ -9,7 +9,7 @@ import warp as wp
 
 from warpslam.field.arrays import EXACT, FieldArrays, Gradients, Thresholds, entries, struct
 from warpslam.field.ray_batch import RayBatch
-from warpslam.kernels import by_sample, compositing, rays
+from warpslam.kernels import by_sample, compositing, rays, touched_rows
 from warpslam.kernels.compositing import Listed
 from warpslam.kernels.decoder.layout import OUT_32, OUT_64, RUN, WEIGHT_SECTIONS, RowGradient, WeightGradient, Weights
 from warpslam.kernels.samples import Span
@@ -247,8 +247,11 @@ def _adjoint(
 
     composited = _composited_backward_by_sample if batch.kernels.by_sample else _composited_backward_by_ray
 
-    def steps(first: int, stop: int, slot: int) -> list[Step]:
-        result = composited(batch, stage, first, stop, slot, thresholds)
+    def by_samples(first: int, stop: int, slot: int) -> list[Step]:
+        return composited(batch, stage, first, stop, slot, thresholds)
+
+    def to_rows(first: int, stop: int, slot: int) -> list[Step]:
+        result: list[Step] = []
         levels = {"coarse": ("coarse",), "middle": ("middle",)}.get(stage, ("middle", "fine"))
         for level in levels:
             if gradients.points or level in gradients.grids:
@@ -259,8 +262,63 @@ def _adjoint(
             result.append(collect_rays(batch, gradients, first, stop))
         return result
 
-    commands = batch.launcher.slice_commands(batch.count, steps, whole=batch.kernels.by_sample)
-    return partial(run_slices, commands)
+    return rows_listed_between(batch, arrays, gradients, by_samples, to_rows, min_gradient=thresholds.min_gradient)
+
+
+def rows_listed_between(
+    batch: RayBatch,
+    arrays: FieldArrays,
+    gradients: Gradients,
+    by_samples: Callable[[int, int, int], list[Step]],
+    to_rows: Callable[[int, int, int], list[Step]],
+    *,
+    min_gradient: float = 0.0,
+) -> Callable[[], None]:
+    """A backward pass as a function that replays its launches: the gradients of the samples, the rows that these touch,
+    for levels that want them listed, and from samples to rows and rays.
+
+    by_samples, to_rows: Steps of a slice of the rays, as `Launcher.slices` takes them.
+    min_gradient: Of a logit, below which its sample touches nothing.
+    """
+    commands, whole = batch.launcher.slice_commands, batch.kernels.by_sample
+    listing = [level for level in ("fine", "middle", "color") if _lists(gradients, level)]
+    if not listing:
+        return partial(
+            run_slices,
+            commands(batch.count, lambda *part: [*by_samples(*part), *to_rows(*part)], whole=whole),
+        )
+
+    # A level a thread: each lists its rows alone, and so in the same order every time.
+    def list_rows(first: int, stop: int, slot: int) -> list[Step]:
+        return _touch(batch, arrays, gradients, listing[first:stop], min_gradient)
+
+    parts = [commands(batch.count, by_samples, whole=whole), commands(len(listing), list_rows)]
+    return partial(_run_each, [*parts, commands(batch.count, to_rows, whole=whole)])
+
+
+def _run_each(parts: list[list[list[wp.Launch]]]) -> None:
+    for commands in parts:
+        run_slices(commands)
+
+
+def _lists(gradients: Gradients, level: str) -> bool:
+    return level in gradients.grids and gradients.grids[level].touched is not None
+
+
+def _touch(
+    batch: RayBatch, arrays: FieldArrays, gradients: Gradients, levels: list[str], min_gradient: float
+) -> list[Step]:
+    """List the rows of some levels that get a gradient."""
+    result: list[Step] = []
+    for level in levels:
+        touched = gradients.grids[level].touched
+        result.append((touched_rows.clear_touched, 1, [touched]))
+        inputs = [touched, arrays.lattices[level], batch.rays]
+        if level == "color":
+            result.append((touched_rows.touch_colored, batch.count, [*inputs, batch.keep, batch.color_grad]))
+        else:
+            result.append((touched_rows.touch_steep, batch.count, [*inputs, batch.logit_grad, min_gradient]))
+    return result
 
 
 def _composited_backward_by_ray(

@@ -10,7 +10,7 @@ import warp as wp
 from warpslam.camera import Intrinsics
 from warpslam.config import SamplingConfig
 from warpslam.errors import InputError
-from warpslam.field.arrays import FieldArrays
+from warpslam.field.arrays import FieldArrays, Thresholds
 from warpslam.field.passes import render, take_surface_depth
 from warpslam.field.ray_batch import RayBatch
 from warpslam.poses import MAX_DISTANCE, as_numbers, vector_from_pose
@@ -48,8 +48,8 @@ def render_image(
     """Render the view from ``T_world_camera``, every ``stride``-th pixel.
 
     With a ``depth`` image (H, W) [m], samples are placed around it as in mapping. Without one, a first pass spreads
-    its samples
-    evenly over the map, and the depth it finds places those of the second: nothing but the map enters.
+    its samples evenly over the map, and the depth it finds places those of the second: nothing but the map enters.
+    Samples that do not count are left out as in mapping (`SamplingConfig`).
     """
     if (
         not isinstance(stride, int | np.integer)
@@ -85,6 +85,7 @@ def _render(
     guided = depth is not None
     stratified = sampling.stratified if guided else FIRST_PASS_SAMPLES
     batch = RayBatch(rows * width, max(stratified, sampling.stratified + sampling.surface), device)
+    thresholds = Thresholds(sampling.min_weight, 0.0, sampling.min_transmittance)
     pose = wp.array(vector_from_pose(T_world_camera)[None].astype(np.float32), dtype=float, device=device)
     out = RenderedImage(*(np.zeros((height, width, *c), np.float32) for c in ((), (3,), ())))
     for first in range(0, height, rows):
@@ -95,7 +96,7 @@ def _render(
             batch.measured_depth[: batch.count].assign(depth[first : first + count].reshape(-1))
         batch.bound(arrays, use_depth=guided)
         batch.place_samples(stratified, sampling.surface, use_depth=guided)
-        render(batch, arrays, "color" if guided else "fine")
+        render(batch, arrays, "color" if guided else "fine", thresholds=thresholds)
         if not guided:
             # A mean between two surfaces would send the second pass's samples to where nothing is.
             take_surface_depth(batch, FIRST_PASS_OCCUPANCY)

@@ -15,7 +15,6 @@ See `warpslam.kernels.supervision` for the equations.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 import warp as wp
 
@@ -29,14 +28,14 @@ from warpslam.field.passes import (
     color_list,
     geometry_adjoint,
     logits,
+    rows_listed_between,
     steep_list,
     steep_samples,
 )
 from warpslam.field.ray_batch import RayBatch, image_struct
-from warpslam.kernels import supervision, touched_rows
+from warpslam.kernels import supervision
 from warpslam.kernels.supervision import Band, Target
 from warpslam.runtime.launching import Step
-from warpslam.runtime.program import run_slices
 
 GEOMETRY = ("middle", "fine")
 
@@ -125,36 +124,4 @@ def _adjoint(
             result.append(collect_rays(batch, gradients, first, stop))
         return result
 
-    commands, whole = batch.launcher.slice_commands, batch.kernels.by_sample
-    parts = [commands(batch.count, by_samples, whole=whole)]
-    # A level a thread: each lists its rows alone, and so in the same order every time.
-    listing = [level for level in ("fine", "middle", "color") if _lists(gradients, level)]
-    if listing:
-        parts.append(
-            commands(len(listing), lambda first, stop, _: _touch(batch, arrays, gradients, listing[first:stop]))
-        )
-    parts.append(commands(batch.count, to_rows, whole=whole))
-    return partial(_run_each, parts)
-
-
-def _run_each(parts: list[list[list[wp.Launch]]]) -> None:
-    for commands in parts:
-        run_slices(commands)
-
-
-def _lists(gradients: Gradients, level: str) -> bool:
-    return level in gradients.grids and gradients.grids[level].touched is not None
-
-
-def _touch(batch: RayBatch, arrays: FieldArrays, gradients: Gradients, levels: list[str]) -> list[Step]:
-    """List the rows of some levels that get a gradient."""
-    result: list[Step] = []
-    for level in levels:
-        touched = gradients.grids[level].touched
-        result.append((touched_rows.clear_touched, 1, [touched]))
-        inputs = [touched, arrays.lattices[level], batch.rays]
-        if level == "color":
-            result.append((touched_rows.touch_colored, batch.count, [*inputs, batch.keep, batch.color_grad]))
-        else:
-            result.append((touched_rows.touch_steep, batch.count, [*inputs, batch.logit_grad]))
-    return result
+    return rows_listed_between(batch, arrays, gradients, by_samples, to_rows)

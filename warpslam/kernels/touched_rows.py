@@ -65,12 +65,14 @@ def clear_touched(touched: Touched):
 
 
 @wp.kernel(module=MODULE)
-def touch_steep(touched: Touched, lattice: Lattice, rays: Rays, logit_grad: wp.array[float]):
-    """List the rows around the samples whose logit has a gradient. On the CPU one thread must do all."""
+def touch_steep(touched: Touched, lattice: Lattice, rays: Rays, logit_grad: wp.array[float], min_gradient: float):
+    """List the rows around the samples whose logit has a gradient beyond ``min_gradient``. On the CPU one thread must
+    do all.
+    """
     tid = wp.tid()
     for n in range(rays.sample_count):
         i = tid * rays.sample_count + n
-        if logit_grad[i] != 0.0:
+        if wp.abs(logit_grad[i]) > min_gradient:
             touch(touched, lattice, sample_point(i, rays))
 
 

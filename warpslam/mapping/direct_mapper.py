@@ -24,6 +24,7 @@ from warpslam.kernels.supervision import Band, Target
 from warpslam.mapping.frustum import mark_seen
 from warpslam.mapping.mapper import MappingResult, all_rows
 from warpslam.mapping.probe import Probe
+from warpslam.mapping.refinement import Refinement
 from warpslam.mapping.window import random_keyframes, replayed_keyframes
 from warpslam.poses import vector_from_pose
 from warpslam.runtime.launching import Launcher
@@ -53,7 +54,7 @@ class DirectMapper:
 
     def __init__(self, scene: SceneMap, camera: Intrinsics, config: Config, device: wp.Device, seed: int) -> None:
         self.scene, self.camera, self.device, self.seed = scene, camera, device, seed
-        self.config, self.supervision = config.mapping, config.supervision
+        self.settings, self.config, self.supervision = config, config.mapping, config.supervision
         settings = self.supervision
         self._launcher = Launcher(device)
         samples = settings.free_samples + settings.near_samples + 1
@@ -92,6 +93,7 @@ class DirectMapper:
         self._decoder.begin()
         self._free: dict[str, np.ndarray] | None = None
         self._is_restricted = False
+        self._changed: dict[str, wp.array] | None = None
         self._probe = Probe(PARTS, PROBED_SHARE, settings, self._target, self._band, device, self._launcher)
         self._window = wp.zeros(PARTS, dtype=int, device=device)
         self._poses = wp.zeros((PARTS, 7), dtype=float, device=device)
@@ -115,13 +117,21 @@ class DirectMapper:
     def refine(
         self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe], rounds: range
     ) -> MappingResult:
-        """Final refinement: several rounds over random keyframes, whose numbers are part of the seeds."""
-        result = MappingResult(pose)
+        """Final refinement: rounds by the direct loss over random keyframes, which completes what was seen for a short
+        time, and as many by the rendering loss. Their numbers are part of the seeds.
+        """
+        changed = []
         for round_ in rounds:
             rng = np.random.default_rng([self.seed, 2, frame, 1 + round_])
             window = random_keyframes(keyframes, PARTS - 1, rng)
-            result = self._optimize(images, frame, pose, window, self.config.iterations, round_=1 + round_)()
-        return result
+            self._optimize(images, frame, pose, window, self.config.refined_directly, round_=1 + round_)()
+            changed.append(self.changed_rows())
+        refinement = Refinement(self.scene, self.camera, self.settings, list(self._rates), self.device, self.seed)
+        loss, window = 0.0, []
+        for round_ in rounds:
+            loss, window = refinement.run(images, frame, pose, keyframes, round_)
+        self._changed = _union([*changed, refinement.changed_rows()], self.device)
+        return MappingResult(pose, {"color": loss}, sorted({keyframe.index for keyframe in window}))
 
     def restrict(self, free: dict[str, np.ndarray] | None, renewed: dict[str, np.ndarray]) -> None:
         """From now on only rows that are true change, bool (rows,) by level, and no decoder; None ends it.
@@ -148,6 +158,8 @@ class DirectMapper:
         """Rows of each level that the last call may have changed, int (n,); levels it left alone are absent."""
         if self._free is not None:
             return all_rows(self._free, self.device)
+        if self._changed is not None:
+            return self._changed
         return {level: self._rows[level].changed_rows() for level in self._rates}
 
     def state(self) -> dict[str, TouchedRowsState]:
@@ -191,6 +203,7 @@ class DirectMapper:
         """Launch a whole call; what is returned reads its outcome."""
         if not self._is_restricted:
             self._free = None
+        self._changed = None
         self._fit()
         for rows in self._rows.values():
             rows.begin()
@@ -248,3 +261,10 @@ class DirectMapper:
                 _log.warning("frame %d: gradients of the %s were not finite and have been left out", frame, name)
         loss = float(self._batch.loss.numpy()[0]) / self._batch.count
         return MappingResult(pose, {"direct": loss}, sorted({keyframe.index for keyframe in window}))
+
+
+def _union(parts: list[dict[str, wp.array]], device: wp.Device) -> dict[str, wp.array]:
+    """Rows of several calls, int (n,) by level, each once."""
+    levels = sorted({level for part in parts for level in part})
+    rows = {level: np.concatenate([part[level].numpy() for part in parts if level in part]) for level in levels}
+    return {level: wp.array(np.unique(which), dtype=int, device=device) for level, which in rows.items()}

@@ -21,6 +21,7 @@ from warpslam.field.passes import render
 from warpslam.field.ray_batch import RayBatch
 from warpslam.field.seeds import ray_seed
 from warpslam.mapping.active_sampling import CellErrors
+from warpslam.mapping.coarse import optimize_coarse
 from warpslam.mapping.depth_start import DepthStart
 from warpslam.mapping.frustum import mark_seen, select_in_frustum
 from warpslam.mapping.window import overlapping_window, random_window
@@ -153,9 +154,10 @@ class Mapper:
         rounds, whose numbers are part of the seeds.
         """
         result = MappingResult(pose)
+        iterations = self.config.refinement_iterations or self.config.iterations
         for round_ in rounds:
             result = self._optimize(
-                images, frame, result.pose, keyframes, self.config.iterations, 1.0, refinement=True, round_=round_
+                images, frame, result.pose, keyframes, iterations, 1.0, refinement=True, round_=round_
             )()
         return result
 
@@ -365,25 +367,21 @@ class Mapper:
         rate_factor: float,
     ) -> None:
         """Coarse stage: no depth guidance, depth loss only, all vertices."""
-        config, batch, arrays, sampling = self.config, self._batch, self.scene.arrays(), self.sampling
-        optimizer = self._grids["coarse"]
-        gradients = Gradients(grids={"coarse": optimizer.wanted()})
-
-        def iterate() -> None:
-            with self._launcher.tape() as tape:
-                batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera)
-                batch.cast(poses)
-                batch.bound(arrays, use_depth=False)
-                batch.place_samples(sampling.stratified, 0, use_depth=False, jitter=sampling.jitter)
-                render(batch, arrays, "coarse", gradients, tape)
-                mapping_loss(batch, 0.0, 1.0 / batch.count if config.loss_reduction == "mean" else 1.0)
-            self._launcher.call(partial(tape.backward, batch.loss))
-            optimizer.update(self.scene.grids["coarse"].features, config.coarse_rate * rate_factor)
-            batch.next_iteration()
-
-        batch.set_seeds([ray_seed(self.seed, 4, frame, n) for n in range(iterations)])
-        for _ in range(iterations):
-            self._launcher.iterate("coarse", (), iterate)
+        config = self.config
+        optimize_coarse(
+            self.scene,
+            self._grids["coarse"],
+            images,
+            slots,
+            poses,
+            self.camera,
+            config,
+            self.sampling,
+            self._batch,
+            self._launcher,
+            [ray_seed(self.seed, 4, frame, n) for n in range(iterations)],
+            config.coarse_rate * rate_factor,
+        )
 
     def _note_loss(self, stage: str, call: _Call) -> None:
         """Keep the loss of the last iteration on the device until the end of the call."""

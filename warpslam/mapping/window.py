@@ -69,10 +69,15 @@ def replayed_keyframes(
 
 def random_keyframes(keyframes: list[Keyframe], count: int, rng: np.random.Generator) -> list[Keyframe]:
     """``count`` keyframes in random order, in turn where there are fewer; none if there are none."""
+    return keyframes_in_turn(keyframes, 0, count, rng)
+
+
+def keyframes_in_turn(keyframes: list[Keyframe], first: int, count: int, rng: np.random.Generator) -> list[Keyframe]:
+    """``count`` keyframes from place ``first`` on of their random order, which repeats; none if there are none."""
     if not keyframes:
         return []
     order = rng.permutation(len(keyframes))
-    return [keyframes[order[n % len(order)]] for n in range(count)]
+    return [keyframes[order[n % len(order)]] for n in range(first, first + count)]
 
 
 def _some(keyframes: list[Keyframe], count: int, rng: np.random.Generator) -> list[Keyframe]:

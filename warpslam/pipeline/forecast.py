@@ -53,9 +53,9 @@ class RecentRate:
 class Forecast:
     """Seconds that are left of a run, asked after every frame.
 
-    Frames go by the rate of those before. What follows them goes by what it is made of: rounds of refinement cost what
-    a call of mapping does, and the pictures what a small one did that is rendered as a probe, once, which changes
-    nothing.
+    Frames go by the rate of those before. What follows them goes by what it is made of: an iteration of refinement
+    costs what one of mapping does, more where it has more samples, and the pictures what a small one did that is
+    rendered as a probe, once, which changes nothing.
 
     Args:
         config: Settings of the run.
@@ -114,7 +114,15 @@ class Forecast:
             call = self._first_call * mapping.iterations / max(mapping.first_iterations, 1)
         else:
             return 0.0
-        return call * (mapping.refinement_rounds if mapping.color_refinement else 0)
+        if not mapping.color_refinement:
+            return 0.0
+        iterations = float(mapping.refinement_iterations or mapping.iterations)
+        if mapping.loss == "direct":  # as many samples a second, of which a ray of the rendering loss has more
+            direct, sampling = self._config.supervision, self._config.sampling
+            samples = direct.free_samples + direct.near_samples + 1
+            iterations = iterations * (sampling.stratified + sampling.surface) / samples + mapping.refined_directly
+        keyframes = len(getattr(self._method, "keyframes", ())) * self._total / max(self._done, 1)
+        return call * iterations / mapping.iterations * mapping.rounds_for(round(keyframes))
 
     def _note_mapping(self, result: FrameResult) -> None:
         seconds = result.timings.get("mapping")

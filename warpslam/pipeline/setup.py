@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -123,7 +124,7 @@ def check_map(path: str | Path | None) -> None:
     Raises:
         CheckpointError: It is not.
     """
-    if path is not None and not Path(path).is_file():
+    if path is not None and not os.path.isfile(path):
         raise CheckpointError(f"{path}: no such file; name the map of a run, or its folder")
 
 

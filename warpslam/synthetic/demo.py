@@ -10,12 +10,6 @@ FRAME_COUNT = 60
 INTRINSICS = Intrinsics(fx=125.0, fy=125.0, cx=79.5, cy=59.5, width=160, height=120)
 ROOM_SEED = 0
 PRESET = "default"
-OVERRIDES = [
-    "mapping.first_iterations=400",
-    "mapping.iterations=60",
-    "tracking.ignore_edge_u=5",
-    "tracking.ignore_edge_v=5",
-]
 
 
 def demo_sequence() -> SyntheticSequence:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -242,7 +243,7 @@ def load_mesh(path: str | Path) -> trimesh.Trimesh | trimesh.Scene:
     import trimesh
 
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise MeshError(f"{path}: no such mesh file")
     try:
         # A scene keeps one geometry per material; loading as one mesh would merge their textures into one.
