@@ -18,7 +18,7 @@ from typing import Any
 
 from warpslam import cli
 from warpslam.batch import worker as batch_worker
-from warpslam.mapping.mapper import Mapper
+from warpslam.mapping.direct_mapper import DirectMapper
 from warpslam.pipeline import run as pipeline
 
 
@@ -40,10 +40,10 @@ def kill_at(owner: Any, name: str, count: int) -> None:
 def main() -> int | None:
     point, count, arguments = sys.argv[1], int(sys.argv[2]), sys.argv[3:]
     targets = {
-        "map": (Mapper, "start_frame"),
+        "map": (DirectMapper, "start_frame"),
         "write": (os, "fsync"),
         "rename": (Path, "replace"),
-        "refine": (Mapper, "refine"),
+        "refine": (DirectMapper, "refine"),
     }
     if point != "never":
         kill_at(*targets[point], count)

@@ -47,8 +47,8 @@ def frames():
     return [sequence[n] for n in range(8)]
 
 
-def new_slam(*overrides: str, device: str = "cpu", seed: int = 0) -> Slam:
-    return Slam(CAMERA, Config.from_preset("default", [*SMALL, *overrides]), device, seed, decoders=DECODERS)
+def new_slam(*overrides: str, preset: str = "default", device: str = "cpu", seed: int = 0) -> Slam:
+    return Slam(CAMERA, Config.from_preset(preset, [*SMALL, *overrides]), device, seed, decoders=DECODERS)
 
 
 def run(frames, *overrides: str, device: str = "cpu", seed: int = 0) -> Slam:
@@ -108,11 +108,12 @@ def test_mapping_lowers_the_depth_error(frames):
 
 def test_bundle_adjustment_writes_poses_back(frames):
     """With enough keyframes, keyframe poses change and the trajectory holds the refined ones; the oldest stays."""
-    slam = run(frames, BY_RENDERING, "mapping.bundle_adjustment_keyframes=2", "mapping.bundle_adjustment_rate=1e-3")
+    by_rendering = BY_RENDERING, "mapping.loss=rendering"
+    slam = run(frames, *by_rendering, "mapping.bundle_adjustment_keyframes=2", "mapping.bundle_adjustment_rate=1e-3")
     first, second = slam.keyframes[:2]
     trajectory = slam.trajectory.poses
     np.testing.assert_allclose(trajectory[first.index], frames[0].T_world_camera, atol=1e-6)
-    off = run(frames, BY_RENDERING, "mapping.bundle_adjustment=false")
+    off = run(frames, *by_rendering, "mapping.bundle_adjustment=false")
     assert not np.allclose(second.pose, off.keyframes[1].pose)
     for keyframe in slam.keyframes:
         np.testing.assert_array_equal(slam.history.pose(keyframe.index), keyframe.pose)
@@ -179,12 +180,12 @@ def test_tracking_goes_by_what_was_seen(frames):
 
 
 def test_given_poses_start_the_map_from_depth(frames):
-    """Where poses are given, vertices start from the depth unless the settings say no; where they are not, only if the
-    settings say so.
+    """Under the rendering loss: where poses are given, vertices start from the depth unless the settings say no; where
+    they are not, only if the settings say so.
     """
 
     def has_started(*overrides: str) -> bool:
-        return bool(run(frames[:1], *overrides).scene.grids["middle"].seen.numpy().any())
+        return bool(run(frames[:1], "mapping.loss=rendering", *overrides).scene.grids["middle"].seen.numpy().any())
 
     given, off, on = "tracking.use_given_poses=true", "mapping.depth_start=false", "mapping.depth_start=true"
     assert has_started(given) and has_started(on)
@@ -328,8 +329,9 @@ def test_bad_frames_are_skipped_and_nothing_is_lost(frames, optimizer):
     """Each fault gives SKIPPED with its reason and leaves the map alone; the camera is known after them. (There are so
     many that direct tracking wants three frames more to believe where it is.)
     """
-    tracked = f"tracking.optimizer={optimizer}"
-    good, slam = run(frames[:2], tracked), run(frames[:2], tracked)
+    loss = {"direct": "direct", "gauss_newton": "rendering"}[optimizer]
+    tracked = f"tracking.optimizer={optimizer}", f"mapping.loss={loss}"
+    good, slam = run(frames[:2], *tracked), run(frames[:2], *tracked)
     features = slam.scene.grids["middle"].features.numpy().copy()
     faults = bad_frames(frames[2])
     for name, (arguments, message) in faults.items():
@@ -417,7 +419,7 @@ def test_a_pose_far_away_costs_one_frame():
     it was, and the frames after it are OK.
     """
     sequence = SyntheticSequence(1, 4, intrinsics=CAMERA)
-    slam = new_slam("tracking.use_given_poses=true", "grid.max_gigabytes=0.2")
+    slam = new_slam("tracking.use_given_poses=true", "grid.max_gigabytes=1")
     frame = sequence[0]
     slam.step(frame.rgb, frame.depth, 0.0, frame.T_world_camera)
     bounds, features = slam.scene.bounds, slam.scene.grids["fine"].features.numpy().copy()

@@ -23,7 +23,7 @@ from warpslam.field.rendering import RenderedImage, render_image
 from warpslam.frames import AdmittedFrame, FrameResult, FrameStatus, admit, check_settings, skipped
 from warpslam.loops.closer import LoopCloser
 from warpslam.mapping.frustum import measured_extent
-from warpslam.mapping.policy import new_mapper
+from warpslam.mapping.policy import images_at_a_time, new_mapper
 from warpslam.mapping.scheduler import MappingTask, new_scheduler
 from warpslam.meshing import extract_mesh
 from warpslam.poses import MAX_DISTANCE, check_transform, is_near
@@ -32,7 +32,7 @@ from warpslam.runtime.environment import named_device
 from warpslam.runtime.exclusive import exclusive
 from warpslam.runtime.launching import synchronize
 from warpslam.runtime.phases import phase
-from warpslam.scene.image_pool import ImagePool, check_window_fits
+from warpslam.scene.image_pool import ImagePool, check_images_fit
 from warpslam.scene.inventory import take_inventory
 from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.mapped_views import ObservedView, SeenDepth
@@ -92,7 +92,7 @@ class Slam:
         self.intrinsics = intrinsics
         self.config = (config if config is not None else Config()).resolved()
         check_settings(intrinsics, self.config)
-        check_window_fits(intrinsics, self.config.keyframes.max_gigabytes, self.config.mapping.window)
+        check_images_fit(intrinsics, self.config.keyframes.max_gigabytes, images_at_a_time(self.config.mapping))
         self.timing = timing
         self.device = named_device(device)
         self.seed = seed

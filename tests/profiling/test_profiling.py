@@ -71,7 +71,7 @@ def run(frames):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(recorder, "matrix_peak_gflops", lambda: 100.0)
         patch.setattr("warpslam.runtime.cores._core_count", lambda: 2)
-        slam = new_slam(*SETTINGS)
+        slam = new_slam(*SETTINGS, preset="rendering")
         with warpslam.profile() as profile:
             timings = [result.timings for result in steps(slam, frames)]
             timings.append(slam.finish())
@@ -230,7 +230,7 @@ def test_phases_nest_and_follow_the_thread():
 @pytest.mark.parametrize("min_transmittance", [0.0, 0.3])
 def test_counted_points_are_those_computed(frames, min_transmittance, monkeypatch):
     """The points counted beforehand are the ones whose outputs a kernel then writes."""
-    slam = new_slam("mapping.first_iterations=60", "mapping.coarse=false")
+    slam = new_slam("mapping.first_iterations=60", "mapping.coarse=false", preset="rendering")
     steps(slam, frames[:1])
     batch, arrays = slam.mapper._batch, slam.scene.arrays()
     thresholds = Thresholds(min_weight=0.02, min_transmittance=min_transmittance)

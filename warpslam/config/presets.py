@@ -30,7 +30,7 @@ def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, A
     }
 
 
-_PAPER_GRID = {"fine_spacing": 0.16}
+_PAPER_GRID = {"fine_spacing": 0.16, "color_spacing": 0.16}
 _TUM_GRID = {"middle_spacing": 0.16, "fine_spacing": 0.08, "color_spacing": 0.08}
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},

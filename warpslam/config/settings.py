@@ -33,7 +33,7 @@ class GridConfig(_Group):
     coarse_spacing: float = Field(2.0, gt=0, description="vertex spacing of the coarse level [m]")
     middle_spacing: float = Field(0.32, gt=0, description="vertex spacing of the middle level [m]")
     fine_spacing: float = Field(0.08, gt=0, description="vertex spacing of the fine level [m]")
-    color_spacing: float = Field(0.16, gt=0, description="vertex spacing of the colour grid [m]")
+    color_spacing: float = Field(0.08, gt=0, description="vertex spacing of the colour grid [m]")
     coarse_std: float = Field(0.01, ge=0, description="standard deviation of the initial coarse features")
     middle_std: float = Field(0.01, ge=0, description="standard deviation of the initial middle features")
     fine_std: float = Field(0.0001, ge=0, description="standard deviation of the initial fine features")

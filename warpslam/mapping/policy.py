@@ -11,8 +11,8 @@ import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics
-from warpslam.config import Config
-from warpslam.mapping.direct_mapper import DirectMapper
+from warpslam.config import Config, MappingConfig
+from warpslam.mapping.direct_mapper import PARTS, DirectMapper
 from warpslam.mapping.mapper import Mapper, MappingResult
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
@@ -60,6 +60,12 @@ class MapOptimizer(Protocol):
 
     def restore(self, state: dict[str, TouchedRowsState]) -> None:
         """Put back what `state` was; the map is already what it was."""
+
+
+def images_at_a_time(config: MappingConfig) -> int:
+    """Images that a call needs on the device: of two windows and the current frame, or of a direct call's parts."""
+    needed = 1 + 2 * config.window
+    return max(needed, PARTS) if config.loss == "direct" else needed
 
 
 def new_mapper(

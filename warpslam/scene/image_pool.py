@@ -278,11 +278,11 @@ def _same(a: FrameMotion, b: FrameMotion) -> bool:
     return a == b or (a.is_none and b.is_none)
 
 
-def check_window_fits(camera: Intrinsics, max_gigabytes: float, window: int) -> None:
-    """Raise `MapSizeError` if images of two windows and the current frame do not fit into ``max_gigabytes``."""
+def check_images_fit(camera: Intrinsics, max_gigabytes: float, count: int) -> None:
+    """Raise `MapSizeError` if ``count`` images do not fit into ``max_gigabytes``."""
     slots = int(min(max_gigabytes * 1e9 / (5 * camera.height * camera.width), 1 << 30))
-    if slots < 1 + 2 * window:
-        raise MapSizeError(_too_many_images(camera, 1 + 2 * window, slots))
+    if slots < count:
+        raise MapSizeError(_too_many_images(camera, count, slots))
 
 
 def _too_many_images(camera: Intrinsics, needed: int, slots: int) -> str:
