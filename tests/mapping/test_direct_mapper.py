@@ -9,7 +9,7 @@ from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.mapping.direct_mapper import DirectMapper
 from warpslam.mapping.mapper import Mapper
-from warpslam.scene.feature_grid import FeatureGrid
+from warpslam.scene.scene_map import new_grid
 from warpslam.slam import Slam
 from warpslam.synthetic import SyntheticSequence
 
@@ -39,7 +39,8 @@ def step(slam: Slam, frames) -> Slam:
 def assert_same(one: Slam, other: Slam) -> None:
     """Every feature, the colour decoder and the optimiser are the same to the bit."""
     for level, grid in one.scene.grids.items():
-        np.testing.assert_array_equal(grid.features.numpy(), other.scene.grids[level].features.numpy(), level)
+        for field, value in vars(grid.state()).items():
+            np.testing.assert_array_equal(value, getattr(other.scene.grids[level].state(), field), f"{level} {field}")
     decoders = one.scene.decoders["color"].weights, other.scene.decoders["color"].weights
     np.testing.assert_array_equal(*(weights.numpy() for weights in decoders))
     states = one.mapper.state(), other.mapper.state()
@@ -95,7 +96,8 @@ def test_beside_tracking_the_tracker_gets_the_rows_that_changed(frames):
     slam.wait()
     assert slam.mapper.scene is not slam.scene
     for level, grid in slam.mapper.scene.grids.items():
-        np.testing.assert_array_equal(grid.features.numpy(), slam.scene.grids[level].features.numpy(), level)
+        for field, value in vars(grid.state()).items():
+            np.testing.assert_array_equal(value, getattr(slam.scene.grids[level].state(), field), f"{level} {field}")
 
 
 @pytest.mark.parametrize("frozen", ["middle", "fine"])
@@ -103,9 +105,9 @@ def test_a_frozen_level_stays_as_it_began(frames, frozen):
     """The other levels are optimised, and the coarse one never is."""
     slam = step(new(f"mapping.optimize_{frozen}=false"), frames[:2])
     for level, grid in slam.scene.grids.items():
-        initial = FeatureGrid(level, grid.spacing, grid.std, slam.seed, slam.device)
+        initial = new_grid(level, slam.config.grid, slam.seed, slam.device)
         initial.update_from(grid, None)
-        is_same = np.array_equal(initial.features.numpy(), grid.features.numpy())
+        is_same = np.array_equal(initial.state().features, grid.state().features)
         assert is_same == (level in ("coarse", frozen)), level
 
 

@@ -100,6 +100,13 @@ def gradient_buffers(row_count: int, device: wp.Device, count: int | None = None
     return wp.zeros((count or slice_count(device), row_count), dtype=Vec32, device=device)
 
 
+def lazy_zeros(shape: tuple[int, ...], device: wp.Device) -> wp.array:
+    """Zeros of `Vec32`; on the CPU memory is taken where it is written to first, and most rows never are."""
+    if device.is_cuda or not all(shape):
+        return wp.zeros(shape, dtype=Vec32, device=device)
+    return wp.array(np.zeros((*shape, 32), np.float32), dtype=Vec32, device=device, copy=False)
+
+
 def entries(rows: wp.array) -> wp.array:
     """The same memory with the 32 numbers of a `Vec32` as another axis; it must not outlive ``rows``."""
     return wp.array(ptr=rows.ptr, dtype=float, shape=(*rows.shape, 32), device=rows.device, copy=False)

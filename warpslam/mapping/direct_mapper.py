@@ -27,6 +27,7 @@ from warpslam.mapping.probe import Probe
 from warpslam.mapping.window import random_keyframes, replayed_keyframes
 from warpslam.poses import vector_from_pose
 from warpslam.runtime.launching import Launcher
+from warpslam.scene.block_grid import reach_of
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.optimizers import ColorDecoderOptimizer
@@ -167,11 +168,13 @@ class DirectMapper:
         on_iteration: Callable | None = None,
     ) -> Callable[[], MappingResult]:
         """Launch a whole call; what is returned reads its outcome."""
+        slots = images.bring([one.image for one in window], [one.motion for one in window])
+        views = [(0, pose), *((slot, one.pose) for slot, one in zip(slots, window, strict=True))]
+        self.scene.make_room(images.arrays, views, self.camera, reach_of(self.supervision.behind))
         self._fit()
         for rows in self._rows.values():
             rows.begin()
         mark_seen(self.scene.grids["color"], self.camera, pose, images.metres())
-        slots = images.bring([one.image for one in window], [one.motion for one in window])
         repeats = PARTS - len(window)
         self._window.assign(np.array([*slots, *[0] * repeats], np.int32))
         poses = [vector_from_pose(T) for T in (*(one.pose for one in window), *[pose] * repeats)]
@@ -181,7 +184,8 @@ class DirectMapper:
         self._probe.measure(arrays, updates, images.arrays, pose, self.camera, len(window), seed)
 
         self._batch.set_seeds([ray_seed(self.seed, 3, frame, n, round_) for n in range(iterations)])
-        uses = [self._batch.seeds, images.rgb, *(grid.features for grid in self.scene.grids.values())]
+        uses = [self._batch.seeds, images.rgb, *(grid.lattice for grid in self.scene.grids.values())]
+        uses += [grid.features for grid in self.scene.grids.values()]
         uses += [rows.updates for rows in self._rows.values()]
         if self.config.moved_margin > 0:
             uses += [frame, round_]  # the pose is an argument of what is recorded

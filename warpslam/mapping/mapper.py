@@ -26,6 +26,7 @@ from warpslam.mapping.frustum import mark_seen, select_in_frustum
 from warpslam.mapping.window import overlapping_window, random_window
 from warpslam.poses import pose_from_vector, vector_from_pose
 from warpslam.runtime.launching import Launcher
+from warpslam.scene.block_grid import reach_of
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.optimizers import ColorDecoderOptimizer, GridOptimizer, PoseOptimizer
@@ -194,6 +195,7 @@ class Mapper:
         together = (*call.window, *coarse)
         in_use = images.bring([one.image for one in together], [one.motion for one in together])
         slots = wp.array([*in_use[: len(call.window)], 0], dtype=int, device=self.device)
+        self._make_room(images, [(0, pose), *((slot, one.pose) for slot, one in zip(in_use, together, strict=True))])
         self._select(images, pose, everything=refinement)
         self._launcher.forget()
 
@@ -270,6 +272,15 @@ class Mapper:
         first = "middle" if self.config.optimize_middle else "fine"
         return [first if j <= middle else "fine" if j <= fine else "color" for j in range(iterations)]
 
+    def _make_room(self, images: ImagePool, views: list[tuple[int, np.ndarray]]) -> None:
+        """Have rows wherever vertices may be selected, and where rays of the window are measured."""
+        if self.scene.config.layout == "dense":
+            return
+        margin = self.config.frustum_margin
+        missing = float(images.current_depth().max())
+        self.scene.make_room(images.arrays, views[:1], self.camera, reach_of(margin, missing), around=margin)
+        self.scene.make_room(images.arrays, views[1:], self.camera, reach_of(0.0))
+
     def _select(self, images: ImagePool, T_world_camera: np.ndarray, *, everything: bool) -> None:
         """Which vertices of each level may change during this call; and note those that the frame has measured."""
         depth = images.metres()
@@ -278,10 +289,10 @@ class Mapper:
             if level in self._frozen:
                 mask = np.zeros(grid.row_count, bool)
             elif level == "coarse" or everything or not self.config.frustum_selection:
-                mask = np.ones(grid.row_count, bool)
+                mask = np.arange(grid.row_count) >= grid.lattice.shared
             else:
                 mask = select_in_frustum(
-                    grid.lattice, grid.shape, self.camera, T_world_camera, depth, self.config.frustum_margin
+                    grid.lattice, grid.row_count, self.camera, T_world_camera, depth, self.config.frustum_margin
                 )
             optimizer.begin(grid, mask)
             if level == "middle" and self._depth_start is not None and not everything:

@@ -37,7 +37,7 @@ _STAGES = (
 _PYTHON_MODULES = {
     "warpslam.rays": ("pixels", "rays", "rejection", "samples"),
     "warpslam.supervision": ("supervision", "touched_rows"),
-    "warpslam.views": ("frustum", "images", "rectify", "seen", "visibility"),
+    "warpslam.views": ("blocks", "frustum", "images", "rectify", "seen", "visibility"),
     "warpslam.direct": ("direct.images", "direct.points", "direct.registration"),
     "warpslam.timing": ("direct.timing",),
     "warpslam.features": ("features.matching", "features.pose", "features.agreement"),

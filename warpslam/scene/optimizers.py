@@ -69,8 +69,8 @@ class GridOptimizer(RowOptimizer):
     """Adam on the selected vertices of one feature grid."""
 
     def begin(self, grid: FeatureGrid, selected: np.ndarray) -> None:
-        """``selected``: bool (rows,), from frustum selection."""
-        self.start(grid.row_count, np.flatnonzero(selected))
+        """``selected``: bool (rows,), from frustum selection; False for rows that are shared."""
+        self.start(grid.capacity, np.flatnonzero(selected))
         self.selected = wp.array(selected.astype(np.uint8), dtype=wp.uint8, device=self.device)
         place = np.where(selected, np.arange(grid.row_count), -1)
         self._place = wp.array(place.astype(np.int32), dtype=int, device=self.device)

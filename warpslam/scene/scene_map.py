@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
 
+from warpslam.camera import Intrinsics
 from warpslam.config import GridConfig
 from warpslam.errors import InputError, MapSizeError
 from warpslam.field.arrays import FieldArrays
@@ -15,11 +17,14 @@ from warpslam.field.decoders import LEVELS, Decoders
 from warpslam.field.packing import PackedDecoder
 from warpslam.field.passes import query
 from warpslam.field.ray_batch import RayBatch
+from warpslam.kernels.blocks import Reach
+from warpslam.kernels.grid import BLOCK_ROWS
 from warpslam.poses import MAX_DISTANCE, as_numbers
 from warpslam.runtime.cores import slice_count
 from warpslam.runtime.environment import free_gigabytes
 from warpslam.runtime.exclusive import ObjectLock, exclusive
 from warpslam.runtime.phases import phase
+from warpslam.scene.block_grid import BlockGrid
 from warpslam.scene.feature_grid import FeatureGrid, GridState
 
 QUERY_CHUNK = 1 << 16
@@ -48,12 +53,7 @@ class SceneMap:
 
     def __init__(self, decoders: Decoders, config: GridConfig, device: wp.Device, seed: int = 0) -> None:
         self.config, self.device, self.decoder_weights, self.seed = config, device, decoders, seed
-        self.grids = {
-            level: FeatureGrid(
-                level, getattr(config, f"{level}_spacing"), getattr(config, f"{level}_std"), seed, device
-            )
-            for level in LEVELS
-        }
+        self.grids = {level: new_grid(level, config, seed, device) for level in LEVELS}
         self.decoders = {weights.level: PackedDecoder(weights, device) for weights in decoders}
         self.low = np.zeros(3)
         self.high = np.zeros(3)
@@ -100,7 +100,7 @@ class SceneMap:
     @property
     def is_empty(self) -> bool:
         """Whether no frame has been mapped yet."""
-        return not self.grids["middle"].row_count
+        return not any(self.grids["middle"].shape)
 
     @phase("growth")
     def cover(self, low: np.ndarray, high: np.ndarray) -> bool:
@@ -136,13 +136,18 @@ class SceneMap:
         if not self.is_empty:
             low, high = np.minimum(low, self.low), np.maximum(high, self.high)
         needed = self.gigabytes(low, high)
+        more = needed - (0.0 if self.is_empty else self.gigabytes(self.low, self.high))
+        self._check_size(low, high, needed, more)
+        return low, high
+
+    def _check_size(self, low: np.ndarray, high: np.ndarray, needed: float, more: float) -> None:
+        """Whether so many gigabytes may be taken in all, and so many more can be."""
         if needed > self.config.max_gigabytes:
             raise MapSizeError(
                 f"the map would grow to {np.round(high - low, 1).tolist()} m and {needed:.1f} GB, beyond "
                 f"grid.max_gigabytes = {self.config.max_gigabytes}: raise it, lower grid.max_depth "
                 f"(now {self.config.max_depth} m), or check the depth scale"
             )
-        more = needed - (0.0 if self.is_empty else self.gigabytes(self.low, self.high))
         free = free_gigabytes(self.device)
         if free is not None and more > free:
             raise MapSizeError(
@@ -150,13 +155,54 @@ class SceneMap:
                 f"{self.device} has {free:.1f} GB free: lower grid.max_depth (now {self.config.max_depth} m), or check "
                 "the depth scale"
             )
-        return low, high
 
     def gigabytes(self, low: np.ndarray, high: np.ndarray) -> float:
-        """Memory of the grids over a box, with both Adam moments and the gradient buffers [GB]."""
-        arrays = 2 + self._buffers + slice_count(self.device)
-        rows = sum(float(np.prod((high - low) / grid.spacing + 2)) for grid in self.grids.values())
-        return rows * 32 * 4 * arrays / 1e9
+        """Memory of the grids over a box, with both Adam moments and the gradient buffers [GB]; of levels in blocks,
+        that of the blocks that were made.
+        """
+        return sum(grid.bytes_over(low, high, self._arrays) for grid in self.grids.values()) / 1e9
+
+    @property
+    def _arrays(self) -> int:
+        """Arrays of a row's size that a row takes, at most."""
+        return 2 + self._buffers + slice_count(self.device)
+
+    @phase("growth")
+    def make_room(
+        self,
+        images: tuple[wp.array, wp.array, wp.array],
+        views: Sequence[tuple[int, np.ndarray]],
+        camera: Intrinsics,
+        reach: Reach,
+        around: float = 0.0,
+    ) -> None:
+        """Have rows for every vertex that a sample of some images touches; dense levels have them.
+
+        Args:
+            images: Colour, depth and scale of images in slots.
+            views: Slot and T_world_camera (4, 4) of each image.
+            camera: Intrinsics.
+            reach: How far rays are followed.
+            around: Vertices so near to a camera get a row, too [m].
+
+        Raises:
+            MapSizeError: As `cover` does.
+        """
+        for grid in self.grids.values():
+            if not isinstance(grid, BlockGrid):
+                continue
+            for slot, T_world_camera in views:
+                blocks = grid.wanted_blocks(images, slot, T_world_camera, camera, reach)
+                self._make(grid, blocks)
+                if around > 0:
+                    center = T_world_camera[:3, 3]
+                    self._make(grid, grid.wanted_in_box(center - around, center + around))
+
+    def _make(self, grid: BlockGrid, blocks: np.ndarray) -> None:
+        if len(blocks):
+            more = len(blocks) * BLOCK_ROWS * 128 * self._arrays / 1e9
+            self._check_size(self.low, self.high, self.gigabytes(self.low, self.high) + more, more)
+            grid.make(blocks)
 
     def arrays(self) -> FieldArrays:
         """What the kernels read, as it is now."""
@@ -207,3 +253,15 @@ class SceneMap:
             return np.zeros((0, 3) if stage == "color" else 0, np.float32)
         result = np.concatenate(parts)
         return np.clip(result, 0.0, 1.0) if stage == "color" else result
+
+
+def new_grid(level: str, config: GridConfig, seed: int, device: wp.Device) -> FeatureGrid:
+    """An empty grid of a level. The coarse one is dense: it forecasts what was not seen, and has few vertices."""
+    spacing, std = getattr(config, f"{level}_spacing"), getattr(config, f"{level}_std")
+    kind = BlockGrid if is_in_blocks(level, config) else FeatureGrid
+    return kind(level, spacing, std, seed, device)
+
+
+def is_in_blocks(level: str, config: GridConfig) -> bool:
+    """Whether a level has rows only where something was seen."""
+    return config.layout == "blocks" and level != "coarse"

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warpslam.field.arrays import GridGradient, entries, struct
+from warpslam.field.arrays import GridGradient, entries, lazy_zeros, struct
 from warpslam.kernels import touched_rows
 from warpslam.kernels.decoder.build import decoders_for
-from warpslam.kernels.grid import Vec32
 from warpslam.kernels.touched_rows import RowState, Touched
 from warpslam.runtime.cores import slice_count
 from warpslam.runtime.launching import Launcher, Step
@@ -50,9 +49,16 @@ class TouchedRows:
 
     def fit(self, grid: FeatureGrid) -> None:
         """Grow to the size of the grid."""
+        old_moments, old_updates, old_shape, old_lattice = self.moments, self.updates, self._shape, self._lattice
+        if grid.lattice.shared:
+            # Rows of blocks stay where they are.
+            if grid.capacity != old_updates.shape[0]:
+                self._allocate(grid)
+                wp.copy(self.moments, old_moments, count=min(old_moments.size, self.moments.size))
+                wp.copy(self.updates, old_updates, count=min(old_updates.size, self.updates.size))
+            return
         if grid.shape == self._shape and (grid.first == self._first).all():
             return
-        old_moments, old_updates, old_shape, old_lattice = self.moments, self.updates, self._shape, self._lattice
         shift = wp.vec3i(*(int(n) for n in self._first - grid.first))
         self._first, self._shape, self._lattice = grid.first.copy(), grid.shape, grid.lattice
         self._allocate(grid)
@@ -61,8 +67,8 @@ class TouchedRows:
             self.launcher.launch(touched_rows.move_rows, old_shape, inputs)
 
     def _allocate(self, grid: FeatureGrid) -> None:
-        rows, device = grid.row_count, self.device
-        self.moments = _lazy_zeros((rows, 2), device)
+        rows, device = grid.capacity, self.device
+        self.moments = lazy_zeros((rows, 2), device)
         self.updates = wp.zeros(rows, dtype=int, device=device)
         self._changed = wp.zeros(rows, dtype=wp.uint8, device=device)
         size = max(min(self.capacity, rows), 1)
@@ -72,7 +78,7 @@ class TouchedRows:
             rows=wp.zeros(size, dtype=int, device=device),
             place=wp.full(rows, -1, dtype=int, device=device),
         )
-        self._gradient = _lazy_zeros((slice_count(device), size), device)
+        self._gradient = lazy_zeros((slice_count(device), size), device)
 
     def begin(self) -> None:
         """Start a call: no row has changed."""
@@ -121,10 +127,3 @@ class TouchedRows:
         updates[state.rows], moments[state.rows] = state.updates, state.moments
         self.updates.assign(updates)
         self.moments.assign(moments)
-
-
-def _lazy_zeros(shape: tuple[int, int], device: wp.Device) -> wp.array:
-    """Zeros of `Vec32`; on the CPU memory is taken where it is written to first, and most rows never are."""
-    if device.is_cuda or not all(shape):
-        return wp.zeros(shape, dtype=Vec32, device=device)
-    return wp.array(np.zeros((*shape, 32), np.float32), dtype=Vec32, device=device, copy=False)
