@@ -15,6 +15,7 @@ from warpslam.scene import scene_map as scene_maps
 from warpslam.scene.block_grid import BlockGrid, reach_of
 from warpslam.scene.feature_grid import FeatureGrid
 from warpslam.scene.image_pool import ImagePool
+from warpslam.scene.keyframes import PlacedImage
 from warpslam.scene.scene_map import SceneMap
 from warpslam.slam import Slam
 from warpslam.slam_state import state_arrays, state_from_arrays
@@ -160,7 +161,7 @@ def test_every_sample_of_an_image_has_rows(frames):
     scene.cover(np.minimum(far.min(axis=0), T[:3, 3]), np.maximum(far.max(axis=0), T[:3, 3]))
     pool = ImagePool(CAMERA, wp.get_device("cpu"))
     pool.set(0, frames[0].rgb, depth)
-    scene.make_room(pool.arrays, [(0, T)], CAMERA, reach_of(0.05))
+    scene.make_room(pool.arrays, [PlacedImage(0, T)], CAMERA, reach_of(0.05))
     rng = np.random.default_rng(0)
     for level in ("middle", "fine", "color"):
         grid = scene.grids[level]
@@ -239,7 +240,7 @@ def test_memory_follows_what_was_seen():
         T = np.eye(4)
         T[0, 3] = x
         scene.cover(np.array([x - 2.0, -1.5, 0.0]), np.array([x + 2.0, 1.5, 2.1]))
-        scene.make_room(pool.arrays, [(0, T)], CAMERA, reach_of(0.05))
+        scene.make_room(pool.arrays, [PlacedImage(0, T)], CAMERA, reach_of(0.05))
         sizes.append(scene.grids["fine"].bytes)
     assert sizes[1] < 2.2 * sizes[0] < 0.1 * 128 * np.prod(scene.grids["fine"].shape)
     low, high = scene.bounds
@@ -254,7 +255,7 @@ def test_refuses_rows_beyond_the_memory_limit():
     pool.set(0, np.zeros((*depth.shape, 3), np.uint8), depth)
     scene.cover(np.array([-3.0, -3.0, 0.0]), np.array([3.0, 3.0, 4.0]))
     with pytest.raises(MapSizeError, match="max_gigabytes"):
-        scene.make_room(pool.arrays, [(0, np.eye(4))], CAMERA, reach_of(0.05))
+        scene.make_room(pool.arrays, [PlacedImage(0, np.eye(4))], CAMERA, reach_of(0.05))
     assert scene.grids["fine"].own_rows == 0
     with pytest.raises(MapSizeError, match="max_gigabytes"):
         scene.cover(np.full(3, -3000.0), np.full(3, 3000.0))

@@ -29,7 +29,7 @@ from warpslam.poses import vector_from_pose
 from warpslam.runtime.launching import Launcher
 from warpslam.scene.block_grid import reach_of
 from warpslam.scene.image_pool import ImagePool
-from warpslam.scene.keyframes import Keyframe
+from warpslam.scene.keyframes import Keyframe, PlacedImage, placed
 from warpslam.scene.optimizers import ColorDecoderOptimizer
 from warpslam.scene.scene_map import SceneMap
 from warpslam.scene.touched_rows import TouchedRows, TouchedRowsState
@@ -169,7 +169,7 @@ class DirectMapper:
     ) -> Callable[[], MappingResult]:
         """Launch a whole call; what is returned reads its outcome."""
         slots = images.bring([one.image for one in window], [one.motion for one in window])
-        views = [(0, pose), *((slot, one.pose) for slot, one in zip(slots, window, strict=True))]
+        views = [PlacedImage(0, pose), *placed(window, slots)]
         self.scene.make_room(images.arrays, views, self.camera, reach_of(self.supervision.behind))
         self._fit()
         for rows in self._rows.values():

@@ -28,7 +28,7 @@ from warpslam.poses import pose_from_vector, vector_from_pose
 from warpslam.runtime.launching import Launcher
 from warpslam.scene.block_grid import reach_of
 from warpslam.scene.image_pool import ImagePool
-from warpslam.scene.keyframes import Keyframe
+from warpslam.scene.keyframes import Keyframe, PlacedImage, placed
 from warpslam.scene.optimizers import ColorDecoderOptimizer, GridOptimizer, PoseOptimizer
 from warpslam.scene.scene_map import SceneMap
 from warpslam.scene.touched_rows import TouchedRowsState
@@ -195,7 +195,7 @@ class Mapper:
         together = (*call.window, *coarse)
         in_use = images.bring([one.image for one in together], [one.motion for one in together])
         slots = wp.array([*in_use[: len(call.window)], 0], dtype=int, device=self.device)
-        self._make_room(images, [(0, pose), *((slot, one.pose) for slot, one in zip(in_use, together, strict=True))])
+        self._make_room(images, PlacedImage(0, pose), placed(together, in_use))
         self._select(images, pose, everything=refinement)
         self._launcher.forget()
 
@@ -272,14 +272,14 @@ class Mapper:
         first = "middle" if self.config.optimize_middle else "fine"
         return [first if j <= middle else "fine" if j <= fine else "color" for j in range(iterations)]
 
-    def _make_room(self, images: ImagePool, views: list[tuple[int, np.ndarray]]) -> None:
+    def _make_room(self, images: ImagePool, current: PlacedImage, window: list[PlacedImage]) -> None:
         """Have rows wherever vertices may be selected, and where rays of the window are measured."""
         if self.scene.config.layout == "dense":
             return
         margin = self.config.frustum_margin
         missing = float(images.current_depth().max())
-        self.scene.make_room(images.arrays, views[:1], self.camera, reach_of(margin, missing), around=margin)
-        self.scene.make_room(images.arrays, views[1:], self.camera, reach_of(0.0))
+        self.scene.make_room(images.arrays, [current], self.camera, reach_of(margin, missing), around=margin)
+        self.scene.make_room(images.arrays, window, self.camera, reach_of(0.0))
 
     def _select(self, images: ImagePool, T_world_camera: np.ndarray, *, everything: bool) -> None:
         """Which vertices of each level may change during this call; and note those that the frame has measured."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +26,7 @@ from warpslam.runtime.exclusive import ObjectLock, exclusive
 from warpslam.runtime.phases import phase
 from warpslam.scene.block_grid import BlockGrid
 from warpslam.scene.feature_grid import FeatureGrid, GridState
+from warpslam.scene.keyframes import PlacedImage
 
 QUERY_CHUNK = 1 << 16
 _log = logging.getLogger(__name__)
@@ -58,6 +59,8 @@ class SceneMap:
         self.low = np.zeros(3)
         self.high = np.zeros(3)
         self._buffers = 1
+        # A second look would find nothing more, unless the box has grown.
+        self._with_rows: dict[Hashable, tuple] = {}
         self._queries: RayBatch | None = None
         self.lock = ObjectLock(outlives_fork=not device.is_cuda)
 
@@ -94,6 +97,7 @@ class SceneMap:
     def restore(self, state: SceneState) -> None:
         """Put back what `state` was; the decoders are those that the map was made with."""
         self.low, self.high = state.low.copy(), state.high.copy()
+        self._with_rows.clear()
         for level, grid in self.grids.items():
             grid.restore(state.grids[level])
 
@@ -113,6 +117,7 @@ class SceneMap:
             return False
         low, high = self._grown(low, high)
         self.low, self.high = low, high
+        self._with_rows.clear()
         for level, grid in self.grids.items():
             # One more coarse cell around, so that the forecast reaches beyond what was seen.
             extra = grid.spacing if level == "coarse" else 0.0
@@ -171,7 +176,7 @@ class SceneMap:
     def make_room(
         self,
         images: tuple[wp.array, wp.array, wp.array],
-        views: Sequence[tuple[int, np.ndarray]],
+        views: Sequence[PlacedImage],
         camera: Intrinsics,
         reach: Reach,
         around: float = 0.0,
@@ -180,7 +185,7 @@ class SceneMap:
 
         Args:
             images: Colour, depth and scale of images in slots.
-            views: Slot and T_world_camera (4, 4) of each image.
+            views: Which, and where they were taken.
             camera: Intrinsics.
             reach: How far rays are followed.
             around: Vertices so near to a camera get a row, too [m].
@@ -188,15 +193,19 @@ class SceneMap:
         Raises:
             MapSizeError: As `cover` does.
         """
-        for grid in self.grids.values():
-            if not isinstance(grid, BlockGrid):
+        for view in views:
+            known = view.T_world_camera.tobytes(), reach.behind, reach.missing, around
+            if view.name is not None and self._with_rows.get(view.name) == known:
                 continue
-            for slot, T_world_camera in views:
-                blocks = grid.wanted_blocks(images, slot, T_world_camera, camera, reach)
-                self._make(grid, blocks)
-                if around > 0:
-                    center = T_world_camera[:3, 3]
-                    self._make(grid, grid.wanted_in_box(center - around, center + around))
+            for grid in self.grids.values():
+                if isinstance(grid, BlockGrid):
+                    blocks = grid.wanted_blocks(images, view.slot, view.T_world_camera, camera, reach)
+                    self._make(grid, blocks)
+                    if around > 0:
+                        center = view.T_world_camera[:3, 3]
+                        self._make(grid, grid.wanted_in_box(center - around, center + around))
+            if view.name is not None:
+                self._with_rows[view.name] = known
 
     def _make(self, grid: BlockGrid, blocks: np.ndarray) -> None:
         if len(blocks):
