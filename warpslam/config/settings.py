@@ -235,6 +235,9 @@ class DirectConfig(_Group):
     )
     window: int = Field(7, ge=0, le=20, description="keyframes refined when one is added; 0 = none")
     window_iterations: int = Field(2, ge=1, le=20, description="iterations of that")
+    window_features: bool = Field(
+        False, description="whether features that these keyframes have in common join their refinement"
+    )
     keyframe_overlap: float = Field(
         0.75, gt=0, lt=1, description="a frame becomes a keyframe where it shares less with the reference"
     )

@@ -9,13 +9,16 @@ import warp as wp
 from tests.tracking.direct.conftest import CAMERA
 from tests.tracking.direct.test_tracker import errors, poses, take, track, tracker
 from warpslam.camera import FrameMotion
+from warpslam.kernels.direct import registration
 from warpslam.poses import inverse, motion_between, motion_of
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
 from warpslam.slam import Slam
 from warpslam.slam_state import write_slam
-from warpslam.tracking.direct.joint_rows import FEATURE_WEIGHT, feature_rows, is_far
+from warpslam.tracking.direct.joint_rows import FEATURE_WEIGHT, feature_rows, is_far, pair_rows
+from warpslam.tracking.direct.pyramid import records
 from warpslam.tracking.direct.second import Picture, SecondWitness
+from warpslam.tracking.direct.window import PairRows, Pose, refine_window
 
 NEXT = motion_of(np.array([0.06, -0.02, 0.05, 0.02, -0.03, 0.01]))
 TWIST = np.array([0.4, 0.1, -0.2, 0.3, 0.5, 0.2])
@@ -76,6 +79,60 @@ def test_keyframe_whose_motion_is_corrected_is_learnt_anew():
     assert not np.array_equal(first.points, second._witness._keyframes[0].points)
 
 
+class Blind:
+    """A registrar whose images say nothing."""
+
+    def overlap(self, row: int, points: list[int], transforms: np.ndarray) -> np.ndarray:
+        return np.ones(len(points))
+
+    def pairs(self, level: int, asked: np.ndarray, grey: float, depth: float) -> np.ndarray:
+        return records(registration.PairSums, len(asked))
+
+
+def test_features_put_keyframes_of_a_window_right():
+    """Three keyframes, the last two off by a centimetre or two: by features alone they come to where they were."""
+    truth = [motion_of(n * np.array([0.05, 0.01, 0.02, 0.01, -0.02, 0.0])) for n in range(3)]
+    off = [np.eye(4), motion_of(0.008 * np.ones(6)), motion_of(-0.006 * np.ones(6))]
+    pool = ImagePool(CAMERA, wp.get_device("cpu"))
+    poses = [T @ error for T, error in zip(truth, off, strict=True)]
+    keyframes = [Keyframe(n, pool.add(*take(T)), poses[n], FrameMotion()) for n, T in enumerate(truth)]
+    second = SecondWitness(CAMERA, wp.get_device("cpu"), 8.0, keyframes, pool)
+
+    def between(i: int, j: int, T: np.ndarray) -> PairRows | None:
+        assert i < j
+        found = second.between(i, j, T)
+        return None if found is None else pair_rows(found, T)
+
+    members = [Pose(n + 1, n, pose) for n, pose in enumerate(poses)]
+    refined = refine_window(Blind(), members, 1, 2.0, 1.0, 3, between)
+    apart = [motion_between(a, b) for a, b in zip(refined, truth, strict=True)]
+    assert motion_between(poses[1], truth[1])[0] > 0.01
+    assert max(step for step, _ in apart) < 4e-3 and max(turn for _, turn in apart) < 0.15
+
+
+def test_keyframes_that_show_something_else_have_no_rows_in_common():
+    """Noise beside a room."""
+    pool = ImagePool(CAMERA, wp.get_device("cpu"))
+    rgb, depth = take(np.eye(4))
+    noise = np.random.default_rng(0).integers(0, 256, rgb.shape, dtype=np.uint8)
+    keyframes = [
+        Keyframe(n, pool.add(image, depth), np.eye(4), FrameMotion()) for n, image in enumerate((rgb, noise))
+    ]
+    second = SecondWitness(CAMERA, wp.get_device("cpu"), 8.0, keyframes, pool)
+    assert second.between(0, 1, np.eye(4)) is None
+
+
+def test_features_that_see_another_place_are_not_rows():
+    """Keyframes that were believed to be a step further than features say."""
+    pool = ImagePool(CAMERA, wp.get_device("cpu"))
+    keyframes = [Keyframe(n, pool.add(*take(np.eye(4))), np.eye(4), FrameMotion()) for n in range(2)]
+    second = SecondWitness(CAMERA, wp.get_device("cpu"), 8.0, keyframes, pool)
+    near, far = (motion_of(np.array([x, 0, 0, 0, 0, 0])) for x in (0.08, 0.12))
+    found = [second.between(0, 1, T) for T in (near, far)]
+    assert found[0] is not None and pair_rows(found[0], near) is not None
+    assert found[1] is not None and pair_rows(found[1], far) is None
+
+
 def test_far_is_a_centimetre_or_half_a_degree():
     """Within them a linearisation holds."""
     near, turned = motion_of([0.009, 0, 0, 0.008, 0, 0]), motion_of([0, 0, 0, 0.01, 0, 0])
@@ -97,9 +154,9 @@ def test_features_are_asked_when_the_settings_say(monkeypatch, when, asked):
 def test_saved_and_loaded_it_goes_on_alike(tmp_path):
     """With rows of features in every frame the poses after loading are the same bytes."""
     frames = [take(pose) for pose in poses(9)]
-    whole = tracker(feature_rows="always")
+    whole = tracker(feature_rows="always", window_features=True)
     expected = [whole.step(*frame) for frame in frames]
-    part = tracker(feature_rows="always")
+    part = tracker(feature_rows="always", window_features=True)
     for frame in frames[:5]:
         part.step(*frame)
     write_slam(tmp_path / "map", part.state())

@@ -25,7 +25,7 @@ STEP, COARSE_STEP = 1.5, 3.0
 """Of the grid [the same], along one direction or along two."""
 KEPT = 6
 """Places that are registered further."""
-LEAST_VIEW = 0.2
+LEAST_VIEW = 0.5
 """Share of the points that must be in view from another place."""
 
 

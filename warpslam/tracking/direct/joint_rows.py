@@ -5,12 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from warpslam.kernels.direct import registration
-from warpslam.poses import inverse, motion_between
+from warpslam.poses import inverse, motion_between, orthonormalized
 from warpslam.tracking.direct.pyramid import records
+from warpslam.tracking.direct.window import PairRows
+from warpslam.tracking.features.device import FoundPose
 from warpslam.tracking.features.witness import FeatureRows
 
 LEAST_INLIERS = 20
 """Features that must agree with a pose for their rows to count."""
+MOST_STEP, MOST_TURN = 0.1, 5.0
+"""Keyframes that features put further away from where they were believed to be [m], [degrees] are not told by them."""
 FEATURE_WEIGHT = 5.0
 """Of a feature's row against one of the images. On rendered sequences, whose truth is known, squared errors of poses
 are 15 to 54 times what the images' normal matrix says, and 3 to 4 times what that of the features says.
@@ -38,6 +42,17 @@ def feature_rows(rows: FeatureRows, T_world_reference: np.ndarray, T_frame_refer
     joining["T"] = T_frame_reference
     joining["H"], joining["g"] = FEATURE_WEIGHT * found.H, FEATURE_WEIGHT * found.b
     return joining
+
+
+def pair_rows(found: FoundPose, T_later_earlier: np.ndarray) -> PairRows | None:
+    """What two keyframes' features say of each other, who believed to be at T_later_earlier (4, 4); None where they see
+    another place: a period of the surface further, say.
+    """
+    T = orthonormalized(found.T_camera_reference @ T_later_earlier)
+    step, turn = motion_between(T, T_later_earlier)
+    if step > MOST_STEP or turn > MOST_TURN:
+        return None
+    return PairRows(T, FEATURE_WEIGHT * found.H, FEATURE_WEIGHT * found.b)
 
 
 def is_far(a: np.ndarray, b: np.ndarray) -> bool:

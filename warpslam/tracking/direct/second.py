@@ -15,6 +15,7 @@ import warp as wp
 from warpslam.camera import NO_MOTION, FrameMotion, Intrinsics
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
+from warpslam.tracking.features.device import FoundPose
 from warpslam.tracking.features.detection import FeatureFrame, SensorTiming, detect, retimed
 from warpslam.tracking.features.settings import FeatureSettings
 from warpslam.tracking.features.witness import FeatureRows, FeatureWitness, Witness
@@ -100,6 +101,11 @@ class SecondWitness:
         """Matches of a frame whose pose is nearly known with keyframes; see `FeatureWitness.rows`."""
         self._learn(keyframes)
         return self._witness.rows(self._features(frame), self._poses(keyframes), keyframes, pose)
+
+    def between(self, earlier: int, later: int, T_later_earlier: np.ndarray) -> FoundPose | None:
+        """Where the points of a keyframe say that a later one is; see `FeatureWitness.between`."""
+        self._learn([earlier, later])
+        return self._witness.between(earlier, later, T_later_earlier)
 
     def _poses(self, keyframes: Sequence[int]) -> dict[int, np.ndarray]:
         return {number: self.keyframes[number].pose for number in keyframes}

@@ -27,13 +27,20 @@ from warpslam.poses import inverse, motion_between, motion_of, orthonormalized, 
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
 from warpslam.tracking.direct.aliases import difference_elsewhere
-from warpslam.tracking.direct.joint_rows import LINEARIZATIONS, WEAK_SIGMA, feature_rows, is_far, weakest_sigma
+from warpslam.tracking.direct.joint_rows import (
+    LINEARIZATIONS,
+    WEAK_SIGMA,
+    feature_rows,
+    is_far,
+    pair_rows,
+    weakest_sigma,
+)
 from warpslam.tracking.direct.map_rows import MapRows
 from warpslam.tracking.direct.measures import Measures
 from warpslam.tracking.direct.pyramid import PyramidPlan, records
 from warpslam.tracking.direct.registrar import MOST_NEAR, Floors, Registrar, new_tasks
 from warpslam.tracking.direct.second import Picture, SecondWitness
-from warpslam.tracking.direct.window import Pose, refine_window
+from warpslam.tracking.direct.window import PairRows, Pose, refine_window
 from warpslam.tracking.features.witness import Witness
 from warpslam.trajectory import TWIST_STEPS, FrameHistory, Located
 
@@ -60,6 +67,10 @@ FOUND_AGREEMENT, FOUND_CORRELATION, FOUND_KNOWN = 0.75, 0.9, 0.25
 BACK_CORRELATION, FOUND_BACK_CORRELATION = 0.5, 0.8
 """Of grey values, looked at from the frame, for any pose and for that of a place found again: less than the other way,
 since it is on small images, where thin lines are lost (0.55 at least on right poses of seven sequences).
+"""
+PLAIN, PLAIN_BACK_CORRELATION = 2.0, 0.35
+"""Where constant speed foretold a pose and grey values fit it to this multiple of their noise, there is little that
+could correlate: a camera over a plain floor has 0.45.
 """
 CONFIRMATIONS = 3
 """Frames that must follow before a place found again is believed."""
@@ -409,7 +420,9 @@ class DirectTracker:
         back, sigma = done.attempt.back, weakest_sigma(done.covariance)
         if back is not None and back.agreement < self.config.lost_agreement:
             return f"looked at from the frame, only {back.agreement:.0%} of the keyframe's depth agrees"
-        if back is not None and back.correlation < BACK_CORRELATION:
+        is_plain = done.attempt.grey_scale < PLAIN * self.config.grey_floor and self._is_near(done.attempt)
+        least = PLAIN_BACK_CORRELATION if is_plain else BACK_CORRELATION
+        if back is not None and back.correlation < least:
             return f"looked at from the frame, grey values of the keyframe correlate by only {back.correlation:.2f}"
         if not sigma < MAX_SIGMA:
             return f"a direction is left open: the position is uncertain by {sigma:.2f} m"
@@ -613,14 +626,18 @@ class DirectTracker:
     def _is_good(self, attempt: Attempt) -> bool:
         """Whether the pose can be believed."""
         m, config = attempt.measures, self.config
-        is_near = self._foretold is not None and attempt.moved < NEAR_SHIFT and m.agreement > config.sure_agreement
         return (
             attempt.ok
             and m.agreement > config.lost_agreement
-            and m.correlation > (config.near_correlation if is_near else config.lost_correlation)
+            and m.correlation > (config.near_correlation if self._is_near(attempt) else config.lost_correlation)
             and m.view > config.lost_view
             and m.known > config.lost_known
         )
+
+    def _is_near(self, attempt: Attempt) -> bool:
+        """Whether the camera went on as it did, as far as depth tells: it need not look as much alike."""
+        agrees = attempt.measures.agreement > self.config.sure_agreement
+        return self._foretold is not None and attempt.moved < NEAR_SHIFT and agrees
 
     # -- search --------------------------------------------------------------------------------------------------
 
@@ -923,6 +940,7 @@ class DirectTracker:
             self.config.grey_weight,
             self.config.depth_weight,
             self.config.window_iterations,
+            self._features_between(active) if self.config.window_features else None,
         )
         moved = set()
         for k, pose in zip(active, poses, strict=True):
@@ -932,6 +950,15 @@ class DirectTracker:
         for index, anchor in enumerate(self._anchors):
             if anchor is not None and anchor.keyframe in moved and index < len(history):
                 history.correct(index, self.keyframes[anchor.keyframe].pose @ anchor.T_keyframe_frame)
+
+    def _features_between(self, members: Sequence[int]) -> Callable[[int, int, np.ndarray], PairRows | None]:
+        """Rows of the features that two of some keyframes have in common."""
+
+        def between(i: int, j: int, T: np.ndarray) -> PairRows | None:
+            found = self._second.between(members[i], members[j], T)
+            return None if found is None else pair_rows(found, T)
+
+        return between
 
     def _ranked(self, number: int) -> list[int]:
         """Keyframes that overlap one, most first."""

@@ -1,18 +1,19 @@
 """Keyframes refined together: direct registration of every overlapping pair, over all poses at once.
 
 With T = W_j^-1 W_i and xi = Ad(T) d_i - d_j for motions W <- W exp(d), a pair adds Ad^T H Ad, H and -Ad^T H after its
-gain and bias are eliminated.
+gain and bias are eliminated. Sparse features that a pair has in common add rows to its H. Their points are not free:
+depth was measured at each, and a keyframe takes its points along.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from warpslam.kernels.direct import registration
-from warpslam.poses import adjoint, inverse, motion_of, orthonormalized
+from warpslam.poses import adjoint, inverse, motion_of, orthonormalized, twist_of
 from warpslam.tracking.direct.pyramid import records
 from warpslam.tracking.direct.registrar import Registrar
 
@@ -36,10 +37,35 @@ class Pose:
     """Whether it stays where it is."""
 
 
+@dataclass(frozen=True)
+class PairRows:
+    """What a pair has in common beside its images, linearised once."""
+
+    T: np.ndarray
+    """T_j_i (4, 4) where it was."""
+    H: np.ndarray
+    """J' W J for T <- exp(xi) T, (6, 6)."""
+    g: np.ndarray
+    """J' W r (6,)."""
+
+    def at(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """H and g near there."""
+        return self.H, self.g + self.H @ twist_of(orthonormalized(T @ inverse(self.T)))
+
+
 def refine_window(
-    registrar: Registrar, members: Sequence[Pose], level: int, grey: float, depth: float, iterations: int
+    registrar: Registrar,
+    members: Sequence[Pose],
+    level: int,
+    grey: float,
+    depth: float,
+    iterations: int,
+    more: Callable[[int, int, np.ndarray], PairRows | None] | None = None,
 ) -> list[np.ndarray]:
-    """Poses (4, 4) of the members after refinement; the first, and those that are fixed, stay where they are."""
+    """Poses (4, 4) of the members after refinement; the first, and those that are fixed, stay where they are.
+
+    more: Rows of the points of member i in the later member j, at T_j_i (4, 4); None where there are none.
+    """
     poses = [member.T_world_camera.copy() for member in members]
     pairs = _overlapping(registrar, members)
     if not pairs:
@@ -48,6 +74,11 @@ def refine_window(
     asked["exposure"] = (1.0, 0.0)
     asked["keyframe"], asked["row"] = zip(*((members[i].points, members[j].row) for i, j in pairs), strict=True)
     count = len(members)
+    added: dict[tuple[int, int], PairRows] = {}
+    for i, j in pairs if more is not None else ():
+        rows = more(i, j, inverse(poses[j]) @ poses[i]) if i < j else None
+        if rows is not None:
+            added[i, j] = rows
     for _ in range(iterations):
         transforms = [inverse(poses[j]) @ poses[i] for i, j in pairs]
         asked["T"] = transforms
@@ -64,6 +95,9 @@ def refine_window(
             step = np.linalg.solve(own, rest)
             pair["exposure"] = np.clip(gain - step[0], 0.3, 3.0), bias - step[1]
             pair["scales"] = found["scales"]
+            if (i, j) in added:
+                H_more, g_more = added[i, j].at(T)
+                h, q = h + H_more, q + g_more
             Ad = adjoint(T)
             A[i, :, i] += Ad.T @ h @ Ad
             A[j, :, j] += h

@@ -196,6 +196,22 @@ class FeatureWitness:
         self._match_keyframes(frame, keyframe_poses, local, reference, np.eye(4), 6.0)
         return FeatureRows(self._finder, self._device_frame(frame), reference, self.depth_sigma)
 
+    def between(self, earlier: int, later: int, T_later_earlier: np.ndarray) -> FoundPose | None:
+        """Pose of a keyframe by the points of an earlier one alone.
+
+        Args:
+            earlier, later: Their numbers.
+            T_later_earlier: Where it is looked for, (4, 4).
+
+        Returns:
+            In axes of the later one as it was believed; None if too few features agree.
+        """
+        frame, before = self._keyframes[later], self._keyframes[earlier]
+        if len(before) == 0 or len(frame) == 0:
+            return None
+        found = self._by_projection(frame, before, T_later_earlier, 15.0, 80)
+        return found or self._by_projection(frame, before, T_later_earlier, 40.0, 60)
+
     def _follow(
         self, frame: FeatureFrame, grey: np.ndarray, previous: Previous, reference: np.ndarray
     ) -> tuple[str, FoundPose | None]:
