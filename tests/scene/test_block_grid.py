@@ -194,7 +194,7 @@ def test_a_run_is_that_of_dense_grids(frames, dense_like_blocks):
         np.testing.assert_array_equal(mine.updates.numpy()[of_blocks], theirs.updates.numpy()[of_dense], level)
         np.testing.assert_array_equal(mine.moments.numpy()[of_blocks], theirs.moments.numpy()[of_dense], level)
         assert theirs.updates.numpy().any() and not mine.updates.numpy()[:BLOCK_ROWS].any()
-        assert other.own_rows < (0.7 if level == "fine" else 1.0) * grid.row_count
+    assert blocks.scene.grids["fine"].own_rows < 0.6 * dense.scene.grids["fine"].row_count
     low, high = dense.scene.bounds
     points = np.random.default_rng(0).uniform(low, high, (5000, 3))
     for level in ("coarse", "middle", "fine"):
