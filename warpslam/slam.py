@@ -26,7 +26,7 @@ from warpslam.mapping.policy import new_mapper
 from warpslam.mapping.scheduler import MappingTask, new_scheduler
 from warpslam.meshing import extract_mesh
 from warpslam.poses import MAX_DISTANCE, check_transform, is_near
-from warpslam.runtime.compilation import compile_kernels
+from warpslam.runtime.compilation import blocks_module, compile_kernels
 from warpslam.runtime.environment import named_device
 from warpslam.runtime.exclusive import exclusive
 from warpslam.runtime.launching import synchronize
@@ -93,7 +93,9 @@ class Slam:
         self.device = named_device(device)
         self.seed = seed
         start = time.perf_counter()
-        compile_kernels(self.device)
+        in_blocks = self.config.grid.layout == "blocks"
+        extra = [blocks_module("cuda" if self.device.is_cuda else "cpu")] if in_blocks else []
+        compile_kernels(self.device, extra=extra)
         self.compile_seconds = time.perf_counter() - start
         self.scene = SceneMap(decoders or load_decoders(self.config.decoders), self.config.grid, self.device, seed)
         self.history = FrameHistory()

@@ -13,7 +13,7 @@ import warp as wp
 
 import warpslam
 from tools.benchmarks.cuda_registers import REGISTER_LIMIT, KernelResources, compiled_cubin, markdown_table, read_cubin
-from warpslam.runtime.compilation import find_module, module_names
+from warpslam.runtime.compilation import blocks_module, find_module, module_names
 
 ARCHITECTURES = (80, 90)
 # Bytes that may be spilled, and why they are.
@@ -24,7 +24,7 @@ SPILLING = {
     "register_jointly": (2580, "the same, for four keyframes"),
     "layer_weights": (1200, "of the baseline: sums eight rows of 32 at once"),
 }
-BUILT = ("warpslam.decoder_cuda", "warpslam.imap_cuda")
+BUILT = ("warpslam.decoder_cuda", "warpslam.decoder_cuda_blocks", "warpslam.imap_cuda")
 """Warp modules whose kernels a function builds."""
 
 
@@ -49,6 +49,7 @@ def test_every_kernel_module_is_found():
 def test_a_run_compiles_every_module_beforehand():
     """What is loaded when a run starts is all there is, but for the renderer of synthetic rooms and the baseline."""
     others = {"warpslam.kernels.raycast", "warpslam.imap_cuda", "warpslam.kernels.imap_density"}
+    others |= {blocks_module("cpu"), blocks_module("cuda")}  # a map in blocks loads them
     for target in ("cpu", "cuda"):
         expected = {name.replace("decoder_cuda", f"decoder_{target}") for name in kernel_modules()}
         assert set(module_names(target)) == expected - others

@@ -42,6 +42,7 @@ _PYTHON_MODULES = {
     "warpslam.timing": ("direct.timing",),
     "warpslam.features": ("features.matching", "features.pose", "features.agreement"),
     **{f"warpslam.decoder_{target}": ("decoder.build",) for target in ("cpu", "cuda")},
+    **{f"warpslam.decoder_{target}_blocks": ("decoder.build",) for target in ("cpu", "cuda")},
     **{f"warpslam.imap_{target}": ("imap_network",) for target in ("cpu", "cuda")},
 }
 """Warp modules that hold the kernels of other Python modules of `warpslam.kernels` than the one of their name."""
@@ -71,8 +72,15 @@ Report = Callable[[ModuleProgress], None]
 
 
 def module_names(target: str) -> list[str]:
-    """Warp modules of a run on ``target`` "cpu" or "cuda", those that take longest to compile first."""
+    """Warp modules of a run on ``target`` "cpu" or "cuda", those that take longest to compile first; with rows in
+    blocks (`grid.layout`), `blocks_module` comes on top.
+    """
     return [f"warpslam.decoder_{target}", *(f"warpslam.{stage}" for stage in _STAGES)]
+
+
+def blocks_module(target: str) -> str:
+    """Warp module of the decoders for rows in blocks."""
+    return f"warpslam.decoder_{target}_blocks"
 
 
 def compile_kernels(device: wp.Device, report: Report | None = None, extra: Sequence[str] = ()) -> list[ModuleProgress]:
