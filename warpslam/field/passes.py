@@ -295,7 +295,7 @@ def _composited_backward_by_sample(
 
 def _kernels(batch: RayBatch, arrays: FieldArrays) -> SimpleNamespace:
     """The decoder kernels for the grids' layout."""
-    return decoders_for(batch.device, arrays.layout)
+    return batch.kernels if arrays.layout == "dense" else decoders_for(batch.device, arrays.layout)
 
 
 def _listed(batch: RayBatch, first: int, slot: int, samples: wp.array, counts: wp.array) -> Listed:
