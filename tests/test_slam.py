@@ -270,6 +270,9 @@ def test_misuse_is_refused(frames):
         ({"depth_timestamp": 0.0}, "needs the timestamp"),
         ({"T_world_camera": np.zeros((4, 4))}, "rotation"),
         ({"T_world_camera": np.eye(3)}, r"shape \(3, 3\)"),
+        ({"depth": np.full((60, 80, 1), 2.0, np.float32)}, r"depth has shape \(60, 80, 1\): pass \(H, W\)"),
+        ({"rgb": frame.rgb.astype(np.float32)}, r"pass uint8, or float in \[0, 1\] \(rgb / 255\)"),
+        ({"rgb": np.full((3, 60, 80), 90, np.uint8)}, r"which is \(3, H, W\): pass \(H, W, 3\)"),
         ({"T_world_camera": [["a"]]}, "no matrix of numbers"),
     ]:
         with pytest.raises(InputError, match=match):
@@ -295,7 +298,6 @@ def bad_frames(frame):
     return {
         "size_of_rgb": ({"rgb": rgb[:10]}, "rgb has shape"),
         "size_of_depth": ({"depth": depth[:10]}, "depth has shape"),
-        "depth_with_a_third_axis": ({"depth": depth[..., None]}, "depth has shape"),
         "gray": ({"rgb": rgb[..., 0]}, "rgb has shape"),
         "integer_rgb": ({"rgb": rgb.astype(np.int32)}, "rgb has dtype int32"),
         "object_rgb": ({"rgb": rgb.astype(object)}, "rgb has dtype object"),
@@ -312,7 +314,7 @@ def bad_frames(frame):
         "black": ({"rgb": np.zeros_like(rgb)}, "black"),
         "nan_rgb": ({"rgb": np.full(rgb.shape, np.nan)}, "black"),
         "over_exposed": ({"rgb": np.full_like(rgb, 255)}, "over-exposed"),
-        "rgb_of_another_range": ({"rgb": rgb.astype(np.float32)}, r"expected \[0, 1\]"),
+        "rgb_of_another_range": ({"rgb": 4.0 * rgb.astype(np.float32)}, r"expected \[0, 1\]"),
         "torch_type_without_numpy": ({"depth": torch.tensor(depth).bfloat16()}, "no counterpart in NumPy"),
         "sparse": ({"depth": torch.tensor(depth).to_sparse()}, "no counterpart in NumPy"),
         "time": ({"timestamp": np.nan}, "timestamp is nan"),

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from warpslam.field.decoders import Decoders as Decoders
     from warpslam.field.rendering import RenderedImage as RenderedImage
     from warpslam.frames import FrameResult as FrameResult
+    from warpslam.pipeline.observer import Observer as Observer
+    from warpslam.pipeline.program import run as run
     from warpslam.profiling import profile as profile
     from warpslam.sequences import open_sequence as open_sequence
     from warpslam.sequences.base import Frame as Frame
@@ -56,6 +58,7 @@ _MODULE_OF = {
     "MemoryBudgetError": "warpslam.errors",
     "MeshError": "warpslam.errors",
     "MissingDependencyError": "warpslam.errors",
+    "Observer": "warpslam.pipeline.observer",
     "OutputError": "warpslam.errors",
     "PRESETS": "warpslam.config",
     "RenderedImage": "warpslam.field.rendering",
@@ -70,6 +73,7 @@ _MODULE_OF = {
     "open_sequence": "warpslam.sequences",
     "profile": "warpslam.profiling",
     "rpe": "warpslam.evaluation",
+    "run": "warpslam.pipeline.program",
 }
 
 __all__ = [*_MODULE_OF, "__version__"]

@@ -64,6 +64,25 @@ class Intrinsics:
         """Camera matrix K, shape (3, 3), float64."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
+    @classmethod
+    def from_matrix(cls, K: np.ndarray, width: int, height: int) -> Intrinsics:
+        """Intrinsics of a camera matrix K (3, 3) of images of ``width`` x ``height`` pixels.
+
+        Raises:
+            InputError: K is no 3x3 matrix of a pinhole without skew.
+            ConfigError: A focal length or a size is not positive.
+        """
+        K = np.asarray(K, dtype=np.float64)
+        if K.shape != (3, 3):
+            raise InputError(f"K has shape {K.shape}, expected (3, 3)")
+        scale = K[2, 2]
+        if abs(scale) < 1e-12 or np.abs(K[2, :2]).max() > 1e-9 * abs(scale):
+            raise InputError("K has no last row 0 0 1: is it transposed, or a projection matrix?")
+        K = K / scale
+        if abs(K[0, 1]) > 1e-3 * abs(K[0, 0]) or abs(K[1, 0]) > 1e-9:
+            raise InputError(f"K has skew {K[0, 1]:g}, which no camera of today has; pass a pinhole matrix")
+        return cls(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), width, height)
+
     def backproject(self, u: np.ndarray, v: np.ndarray, z: np.ndarray | float) -> np.ndarray:
         """Points [m] in the camera's frame of columns, rows and z-depths [m] of one shape (...), shape (..., 3).
 

@@ -211,6 +211,7 @@ def read_images(
         depth_scale = check_number(depth_scale, "depth_scale")
         if not (math.isfinite(depth_scale) and depth_scale > 0):
             raise InputError(f"depth_scale = {depth_scale!r} must be positive: units per metre (for example 1000)")
+    _check_layout(rgb, depth, size)
     if rgb.shape != (*size, 3):
         raise FrameError(f"rgb has shape {rgb.shape}, expected {(*size, 3)} from the intrinsics")
     if depth.shape != size:
@@ -220,6 +221,36 @@ def read_images(
     if fault is not None:
         raise FrameError(fault)
     return rgb, _metres(depth, depth_scale, max_depth)
+
+
+def _check_layout(rgb: np.ndarray, depth: np.ndarray, size: tuple[int, int]) -> None:
+    """Refuse images whose axes are in another order, or that have one too many: no other frame would mend that.
+
+    Raises:
+        InputError: Names the order.
+    """
+    height, width = size
+    others = {
+        (3, height, width): "(3, H, W)",
+        (1, height, width, 3): "(1, H, W, 3)",
+        (1, 3, height, width): "(1, 3, H, W)",
+    }
+    if rgb.shape in others:
+        raise InputError(
+            f"rgb has shape {rgb.shape}, which is {others[rgb.shape]}: pass (H, W, 3), for example "
+            f"{'rgb.transpose(1, 2, 0)' if rgb.ndim == 3 else 'rgb[0]'}"
+        )
+    if depth.ndim > 2 and depth.size == height * width and {1, height, width} == set(depth.shape):
+        raise InputError(f"depth has shape {depth.shape}: pass (H, W), for example depth.squeeze()")
+    if (width, height) in (rgb.shape[:2], depth.shape) and width != height:
+        name, image = ("rgb", rgb) if rgb.shape[:2] == (width, height) else ("depth", depth)
+        raise InputError(f"{name} has shape {image.shape}: the first axis is the row, so pass (H, W) = {size}")
+    if rgb.dtype.kind == "f" and rgb.size:
+        largest = float(np.nan_to_num(rgb, nan=0.0, posinf=0.0, neginf=0.0).max())
+        if 2.0 < largest <= 255.5 and rgb.shape == (*size, 3):
+            raise InputError(
+                f"rgb is {rgb.dtype} with values up to {largest:.4g}: pass uint8, or float in [0, 1] (rgb / 255)"
+            )
 
 
 def _to_numpy(array: Any, name: str) -> np.ndarray:
@@ -278,6 +309,9 @@ def _metres(depth: np.ndarray, depth_scale: float | None, max_depth: float) -> n
     count = np.count_nonzero(usable)
     if count < MIN_DEPTH_PIXELS:
         within = f" within {max_depth:g} m" if math.isfinite(max_depth) else ""
+        beyond = depth[np.isfinite(depth) & (depth > max_depth)]
+        if beyond.size > MIN_DEPTH_PIXELS and (median := float(np.median(beyond))) > 100.0:
+            raise FrameError(f"median depth is {median:.0f} m: is it in millimetres? Depth is in metres (depth / 1000)")
         raise FrameError(f"fewer than {MIN_DEPTH_PIXELS} pixels have depth{within} (only {count} of {depth.size})")
     return np.where(usable, depth, np.float32(0.0))
 
@@ -291,9 +325,11 @@ def check_settings(camera: Intrinsics, config: Config) -> None:
     """
     tracking = config.tracking
     if camera.width <= 2 * tracking.ignore_edge_u or camera.height <= 2 * tracking.ignore_edge_v:
+        fit_u, fit_v = camera.width // 16, camera.height // 12
         raise InputError(
             f"tracking.ignore_edge_u = {tracking.ignore_edge_u} and ignore_edge_v = {tracking.ignore_edge_v} "
-            f"leave nothing of a {camera.width} x {camera.height} image: lower them"
+            f"leave nothing of a {camera.width} x {camera.height} image: lower them, for example with "
+            f"--set tracking.ignore_edge_u={fit_u} tracking.ignore_edge_v={fit_v}"
         )
     if tracking.use_given_poses and config.keyframes.policy == "information_gain":
         raise ConfigError("keyframes.policy = information_gain needs tracking; use interval with given poses")

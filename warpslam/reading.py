@@ -5,10 +5,9 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from functools import cache
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 MEGABYTE = 1 << 20
 TEXT_LIMIT = 64 * MEGABYTE
@@ -70,15 +69,19 @@ def read_text(path: str | Path, limit: float = TEXT_LIMIT, encoding: str = "utf-
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-class _PlainLoader(yaml.SafeLoader):
+@cache
+def _plain_loader() -> Any:
     """Without aliases, by which a kilobyte unfolds into gigabytes."""
+    import yaml  # who only lists readers need not wait for it
 
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        """As its parent has it."""
-        if self.check_event(yaml.AliasEvent):
-            event = self.peek_event()
-            raise yaml.YAMLError(f"an alias (*{event.anchor[:50]}), which is not supported: write the value out")
-        return super().compose_node(parent, index)
+    class PlainLoader(yaml.SafeLoader):
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                event = self.peek_event()
+                raise yaml.YAMLError(f"an alias (*{event.anchor[:50]}), which is not supported: write the value out")
+            return super().compose_node(parent, index)
+
+    return PlainLoader
 
 
 def load_yaml(text: str | bytes) -> Any:
@@ -87,10 +90,12 @@ def load_yaml(text: str | bytes) -> Any:
     Raises:
         ValueError: It is no yaml, too long, or has aliases or values that can't be.
     """
+    import yaml
+
     if len(text) > YAML_LIMIT:
         raise ValueError(f"{len(text) / MEGABYTE:.1f} MB are no settings, expected at most {YAML_LIMIT / MEGABYTE:g}")
     try:
-        return yaml.load(text, _PlainLoader)  # noqa: S506 (a SafeLoader)
+        return yaml.load(text, _plain_loader())  # noqa: S506 (a SafeLoader)
     except ValueError:
         raise
     except RecursionError:

@@ -5,15 +5,18 @@ A pose is ``T_world_camera``, float64 (4, 4), lengths in metres.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 
+from warpslam.camera import Intrinsics
 from warpslam.frames import FrameStatus
 from warpslam.poses import are_rigid, inverse, motion_between, twist_of
 from warpslam.storage.state_file import StateFields
+from warpslam.storage.trajectory_files import Views, write_trajectory
 
 RECENT_FRAMES = 20
 TWIST_STEPS = 2
@@ -31,6 +34,26 @@ class Trajectory:
     """T_world_camera, float64 (N, 4, 4)."""
     status: list[FrameStatus]
     """Of each frame."""
+
+    def save(
+        self, path: str | Path, kind: str = "tum", camera: Intrinsics | None = None, images: Sequence[str] = ()
+    ) -> Path:
+        """Write the poses of all frames that are OK, in one of the formats that other tools read.
+
+        Args:
+            path: File; a folder for colmap.
+            kind: "tum", "kitti" (all frames, a line each), "euroc", "transforms" (nerfstudio) or "colmap".
+            camera: Camera of the images; the last two formats need it.
+            images: Paths of the images, for the same; one a frame.
+
+        Raises:
+            ConfigError: There is no such format, or it needs a camera.
+            OSError: The file can't be written.
+        """
+        poses = self.poses.copy()
+        if kind != "kitti":
+            poses[[status is not FrameStatus.OK for status in self.status]] = np.nan
+        return write_trajectory(path, Views(self.timestamps, poses, camera, images), kind)
 
     def after(self, first: int) -> Trajectory:
         """The frames from number ``first`` on."""

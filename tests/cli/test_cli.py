@@ -13,7 +13,7 @@ from trimesh.proximity import closest_point_naive
 from tests.fakes import FakeSequence, FakeSlam, Terminal, wall
 from warpslam import __version__, cli
 from warpslam.cli.common import parse_frames
-from warpslam.errors import DatasetError
+from warpslam.errors import ConfigError, DatasetError
 from warpslam.field.decoders import random_decoders
 from warpslam.pipeline import finished as revisit
 from warpslam.pipeline import run as pipeline
@@ -73,7 +73,7 @@ def test_settings_from_a_file(faked, tmp_path, capsys, command):
     file, out = tmp_path / "c.yaml", ["-o", str(tmp_path / "out")]
     for text, message in (
         ("mapping: {window: 0}", "c.yaml: mapping.window"),
-        ("mapping: {windw: 3}", "c.yaml: mapping.windw"),
+        ("mapping: {windw: 3}", "c.yaml: no setting mapping.windw; did you mean mapping.window?"),
         ("[]", "c.yaml: expected a mapping"),
         ("a: b: c", "c.yaml: can't be read as yaml"),
     ):
@@ -345,3 +345,19 @@ def test_progress_bar_on_a_terminal(monkeypatch, faked, tmp_path):
     assert cli.main(["run", "seq", "--frames", "0:6", "-o", str(tmp_path)]) == 0
     text = terminal.getvalue()
     assert "fake sequence" in text and "6/6" in text and "ATE 0." in text and "fps" in text
+
+
+def test_set_does_not_swallow_the_folder(capsys):
+    """A word that is no KEY=VALUE is named, and where the folder goes."""
+    with pytest.raises(SystemExit):
+        cli.main(["run", "--set", "mapping.every=2", "scans/kitchen"])
+    assert "--set scans/kitchen: is no KEY=VALUE; if it is the folder, name it before --set" in capsys.readouterr().err
+
+
+def test_a_gpu_that_is_not_there(tmp_path, capsys, monkeypatch):
+    """Is told without a traceback, and before anything is written."""
+    from warpslam.pipeline import setup
+
+    monkeypatch.setattr(setup.wp, "get_devices", lambda: ["cpu"])
+    with pytest.raises(ConfigError, match="device 'cuda' is not there; this machine has cpu"):
+        setup.check_device("cuda")

@@ -63,7 +63,7 @@ def test_settings_as_json(capsys):
     rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
     dump = Config().model_dump()
     names = [f"{g}.{n}" for g, v in dump.items() if isinstance(v, dict) for n in v]
-    assert set(rows) == {*names, "schedule", "published_images", "sensor_timing", "decoders"}
+    assert set(rows) == {*names, "schedule", "published_images", "sensor_timing", "scene_scale", "decoders"}
     for name in names:
         group, field = name.split(".")
         assert rows[name]["default"] == dump[group][field]

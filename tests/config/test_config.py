@@ -115,7 +115,10 @@ def test_settings_of_a_file_with_overrides(tmp_path):
     assert config.tracking == Config().tracking
     config.save(tmp_path / "all.yaml")
     assert Config.from_file(tmp_path / "all.yaml") == config
-    for text, message in (("", "mine.yaml: expected a mapping"), ("mapping: {n: 1}", "mine.yaml: mapping.n")):
+    for text, message in (
+        ("", "mine.yaml: expected a mapping"),
+        ("mapping: {n: 1}", "mine.yaml: no setting mapping.n"),
+    ):
         path.write_text(text)
         with pytest.raises(ConfigError, match=message):
             Config.from_file(path)
@@ -208,3 +211,37 @@ def test_yaml_that_breaks_the_parser(tmp_path, text):
         Config.load(tmp_path / "broken.yaml")
     with pytest.raises(ConfigError):
         Config.from_preset("default", [f"mapping.pixels={text}"])
+
+
+@pytest.mark.parametrize(
+    ("override", "pattern"),
+    [
+        ("mapping.iteration=30", "no setting mapping.iteration; did you mean mapping.iterations"),
+        ("max_depth=30", "no setting max_depth; did you mean grid.max_depth"),
+        ("scene_scales=30", "no setting scene_scales; did you mean scene_scale"),
+        ("xyzzy=30", "no setting xyzzy$"),
+    ],
+)
+def test_a_slip_of_the_pen_is_corrected(override, pattern):
+    """The name that was most likely meant, in our words."""
+    with pytest.raises(ConfigError, match=pattern):
+        Config.from_preset("default", [override])
+
+
+def test_scene_scale_multiplies_every_length():
+    """Once, squares of lengths twice; turns and shares stay, and what a run writes down has it in effect."""
+    config = Config.from_preset("default", ["scene_scale=0.5", "mapping.moved_margin=0.2"])
+    plain, scaled = Config.from_preset("default", ["mapping.moved_margin=0.2"]).resolved(), config.resolved()
+    assert scaled.scene_scale == 1.0 and scaled.resolved() == scaled
+    for group, name in (
+        ("grid", "fine_spacing"), ("grid", "margin"), ("grid", "max_depth"), ("tracking", "lost_depth_error"),
+        ("tracking", "max_step"), ("mapping", "moved_margin"), ("mapping", "frustum_margin"), ("meshing", "voxel"),
+        ("tsdf", "voxel"),
+    ):  # fmt: skip
+        assert getattr(getattr(scaled, group), name) == 0.5 * getattr(getattr(plain, group), name), name
+    assert scaled.meshing.min_component_area == 0.25 * plain.meshing.min_component_area
+    assert scaled.tracking.max_turn == plain.tracking.max_turn
+    rates = [c.tracking.learning_rate * c.tracking.rotation_rate_factor for c in (scaled, plain)]
+    assert rates[0] == pytest.approx(rates[1])
+    with pytest.raises(ConfigError, match="scene_scale"):
+        Config.from_preset("default", ["scene_scale=0"])

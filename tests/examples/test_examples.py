@@ -21,7 +21,7 @@ PROGRAMS = sorted(path.stem for path in Path(examples.__file__).parent.glob("[!_
 
 def test_every_program_is_listed():
     """The package's description names each program, and each is short enough to be read at once."""
-    assert PROGRAMS == ["first_steps", "known_poses", "localize_in_a_map", "own_camera"]
+    assert PROGRAMS == ["first_steps", "known_poses", "live_camera", "localize_in_a_map", "own_camera", "own_reader"]
     for name in PROGRAMS:
         assert f"    {name} " in examples.__doc__
         assert len((Path(examples.__file__).parent / f"{name}.py").read_text().splitlines()) <= 45

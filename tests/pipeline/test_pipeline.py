@@ -293,8 +293,8 @@ def test_extract_mesh_options(fake_slam, tmp_path):
     _, path = revisit.extract_mesh(folder, output=tmp_path / "m.glb", refinement_rounds=3)
     assert path.read_bytes()[:4] == b"glTF" and fake_slam.loaded[-1].refined == 3
     count = len(fake_slam.loaded)
-    with pytest.raises(MeshError, match="m.obj"):
-        revisit.extract_mesh(folder, output=tmp_path / "m.obj")
+    with pytest.raises(MeshError, match="m.xyz"):
+        revisit.extract_mesh(folder, output=tmp_path / "m.xyz")
     assert len(fake_slam.loaded) == count
 
 

@@ -201,8 +201,8 @@ def test_unopenable_folder_is_one_error(tmp_path):
     report = check_folder(tmp_path / "nowhere")
     assert [finding.check for finding in report.errors] == ["sequence"] and not report.name
     writers.write_replica(tmp_path / "room")
-    (tmp_path / "room" / "results" / "depth000001.png").unlink()
-    expect(check_folder(tmp_path / "room"), "sequence", ERROR, "3 colour images but 2 depth images")
+    (tmp_path / "room" / "camera.yaml").write_text("fx: 1")
+    expect(check_folder(tmp_path / "room"), "sequence", ERROR, "camera.yaml: field fy")
 
 
 def test_tum_images_without_partner(tmp_path):

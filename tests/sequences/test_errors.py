@@ -49,7 +49,7 @@ def test_no_images(tmp_path):
 
 @pytest.mark.parametrize("dataset", ["replica", "scannet", "seven_scenes", "icl", "azure"])
 def test_unequal_counts(tmp_path, dataset):
-    """A colour image without depth."""
+    """A colour image without depth is left out and named; the others keep their partners and poses."""
     if dataset == "replica":
         writers.write_replica(tmp_path)
         victim = tmp_path / "results" / "depth000001.png"
@@ -61,24 +61,51 @@ def test_unequal_counts(tmp_path, dataset):
         victim = tmp_path / "frame-000001.depth.png"
     else:
         writers.write_color_depth(tmp_path, "image" if dataset == "icl" else "color")
+        writers.write_log(tmp_path / "trajectory.log", {i: writers.make_pose(i) for i in range(3)})
         victim = tmp_path / "depth/00001.png"
     victim.unlink()
-    refuse(tmp_path, "3 colour images but 2 depth images", dataset=dataset, camera=writers.CAMERA)
+    sequence = open_sequence(tmp_path, dataset=dataset, camera=writers.CAMERA)
+    assert len(sequence) == 2
+    (remark,) = sequence.remarks
+    assert re.search(r"1 images have no partner .*1?\.(png|jpg)|2\.jpg", remark.message) and not remark.is_fine
+    for index, source in enumerate((0, 2)):
+        frame = sequence[index]
+        assert np.median(np.abs(frame.depth - writers.make_depth(source) / 1000)) == pytest.approx(0, abs=1e-6)
+        assert abs(int(frame.rgb[8, 8, 1]) - 10 * source) < 8
+        np.testing.assert_allclose(frame.T_world_camera, writers.make_pose(source), atol=1e-12)
 
 
-def test_numbers_do_not_match(tmp_path):
-    """As many colour as depth images, of different frames."""
-    writers.write_replica(tmp_path)
-    (tmp_path / "results" / "depth000001.png").rename(tmp_path / "results" / "depth000007.png")
-    refuse(tmp_path, r"frame000001\.png has no depth image of the same number \(next is depth000002\.png\)")
+def test_pairs_by_number_not_by_rank(tmp_path):
+    """As many colour as depth images, of different frames: those that both have are the frames."""
+    writers.write_replica(tmp_path, 4)
+    (tmp_path / "results" / "depth000001.png").rename(tmp_path / "results" / "depth000009.png")
+    sequence = open_sequence(tmp_path)
+    assert [frame.rgb[0, 0, 1] // 10 for frame in sequence] == [0, 2, 3]
+    np.testing.assert_array_equal(sequence[1].depth, writers.make_depth(2).astype(np.float32) / np.float32(1000))
+    np.testing.assert_allclose(sequence[1].T_world_camera, writers.make_pose(2), atol=1e-12)
+    assert re.search(r"frame000001\.png, results/depth000009\.png", sequence.remarks[0].message)
+
+
+def test_numbers_that_say_nothing(tmp_path):
+    """Names without a common number are pairs in their order where the counts agree, and refused where not."""
+    for i in range(3):
+        writers.write_image(tmp_path / "color" / f"{i}.png", writers.make_rgb(i))
+        writers.write_image(tmp_path / "depth" / f"{i + 700}.png", writers.make_depth(i))
+    assert len(open_sequence(tmp_path, camera=writers.CAMERA)) == 3
+    (tmp_path / "depth/701.png").unlink()
+    refuse(tmp_path, "3 colour images but 2 depth images", camera=writers.CAMERA)
 
 
 def test_pose_count(tmp_path):
-    """More poses than frames."""
-    writers.write_replica(tmp_path)
-    with (tmp_path / "traj.txt").open("a") as file:
-        file.write(" ".join(["1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"]) + "\n")
-    refuse(tmp_path, "4 poses but 3 frames")
+    """More poses than frames are taken by frame number; fewer are refused."""
+    writers.write_replica(tmp_path, 4)
+    for kind in ("frame", "depth"):
+        (tmp_path / "results" / f"{kind}000001.png").unlink()
+    truth = open_sequence(tmp_path).ground_truth()
+    np.testing.assert_allclose(truth, [writers.make_pose(i) for i in (0, 2, 3)], atol=1e-12)
+    lines = (tmp_path / "traj.txt").read_text().splitlines()
+    (tmp_path / "traj.txt").write_text("\n".join(lines[:2]))
+    refuse(tmp_path, r"traj\.txt: 2 poses but 3 frames")
 
 
 @pytest.mark.parametrize("keep", [0, 0.5, 0.95])
@@ -139,7 +166,7 @@ def test_depth_of_wrong_kind(tmp_path, image):
 
 
 def test_size_does_not_match(tmp_path):
-    """Images of another size than the camera's, depth and colour."""
+    """Images of another size than the camera's."""
     folder = writers.write_replica(tmp_path, 1)
     refuse(
         folder,
@@ -148,8 +175,6 @@ def test_size_does_not_match(tmp_path):
         "is 48 x 32",
         camera="20,20,1,1,48,32,1000",
     )
-    writers.write_image(folder / "results" / "frame000000.png", writers.make_rgb(0, 30, 20))
-    refuse(folder, r"frame000000\.png: colour image is 30 x 20", r"camera\.yaml\) is 24 x 16")
 
 
 @pytest.mark.parametrize(
@@ -270,9 +295,14 @@ def test_malformed_pose_files(tmp_path):
     file.write_text("1 0 0 0\n0 1 0 0\n0 0 1 0\n")
     refuse(tmp_path / "a", r"2\.txt: 3 lines of numbers, expected the 4 rows", camera=writers.CAMERA)
     file.unlink()
-    refuse(tmp_path / "a", r"2\.txt: no pose of 2\.jpg", camera=writers.CAMERA)
     (writers.write_seven_scenes(tmp_path / "b") / "frame-000001.pose.txt").unlink()
-    refuse(tmp_path / "b", r"frame-000001\.pose\.txt: missing", camera=writers.CAMERA)
+    for name, pattern in (
+        ("a", r"1 of 3 frames have no file in .*: 2\.txt"),
+        ("b", r"1 of 3 .*frame-000001\.pose\.txt"),
+    ):
+        sequence = open_sequence(tmp_path / name, camera=writers.CAMERA)
+        assert re.search(pattern, sequence.remarks[-1].message) and sequence[1].T_world_camera is None
+        assert sequence[0].T_world_camera is not None and sequence[2].T_world_camera is not None
 
 
 def test_damaged_exr(tmp_path):

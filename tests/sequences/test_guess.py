@@ -45,7 +45,7 @@ def test_aliases(tmp_path, alias, name):
 def test_built_in_cameras_load():
     """Every camera file in the package is complete and gives intrinsics."""
     files = [f for f in (resources.files("warpslam.sequences") / "cameras").iterdir() if f.name.endswith(".yaml")]
-    assert len(files) == 9
+    assert len(files) == 10
     for file in files:
         calibration = Calibration.of_dataset(file.name.removesuffix(".yaml"))
         assert calibration.stored.fx == yaml.safe_load(file.read_text())["fx"]

@@ -14,8 +14,8 @@ from warpslam.errors import DatasetError
 from warpslam.poses import check_transform, pose_from_vector
 from warpslam.sequences import open_sequence
 from warpslam.sequences.calibration import CAMERA_FIELDS, Calibration
-from warpslam.sequences.files import frame_number
 from warpslam.sequences.image_files import natural_key
+from warpslam.sequences.pairing import frame_number
 from warpslam.sequences.pose_files import read_matrix_file, read_matrix_lines, read_redwood_log, read_tum_poses
 
 # The same examples on every machine, however busy it is.

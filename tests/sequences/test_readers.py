@@ -75,37 +75,70 @@ def test_camera_argument_wins(tmp_path):
 
 
 def test_tum_association(tmp_path):
-    """TUM: nearest depth and pose, both within 0.08 s, frames at least 1/32 s apart."""
+    """TUM: every colour image with depth within 0.08 s is a frame, whatever its pose; the paper's code takes those with
+    a pose within 0.08 s, at least 1/32 s apart.
+    """
     folder = writers.write_tum(
         tmp_path,
-        times=[10.00, 10.02, 10.10, 10.50, 11.00],
-        depth_times=[9.97, 10.03, 10.13, 11.06],
+        times=[10.00, 10.02, 10.10, 10.50, 10.70, 11.00],
+        depth_times=[9.97, 10.03, 10.13, 10.71, 11.06],
         pose_times=[10.01, 10.09, 10.50, 10.93],
     )
     sequence = open_sequence(folder, camera=writers.CAMERA)
-    # 10.02 is too close to 10.00; 10.50 has no depth; 11.00 takes depth 11.06 and pose 10.93, both just near enough.
-    assert [frame.timestamp for frame in sequence] == [10.00, 10.10, 11.00]
-    for index, (rgb, depth, pose) in enumerate([(0, 0, 0), (2, 2, 1), (4, 3, 3)]):
-        frame = sequence[index]
+    # 10.50 has no depth, 10.70 no pose; 11.00 takes depth 11.06 and pose 10.93, both just near enough.
+    assert [frame.timestamp for frame in sequence] == [10.00, 10.02, 10.10, 10.70, 11.00]
+    expected = [(0, 0, 0), (1, 1, 0), (2, 2, 1), (4, 3, None), (5, 4, 3)]
+    for frame, (rgb, depth, pose) in zip(sequence, expected, strict=True):
         np.testing.assert_array_equal(frame.rgb, writers.make_rgb(rgb))
         np.testing.assert_array_equal(frame.depth, writers.make_depth(depth).astype(np.float32) / np.float32(1000))
-        np.testing.assert_allclose(frame.T_world_camera, writers.make_pose(pose), atol=1e-12)
+        if pose is None:
+            assert frame.T_world_camera is None
+        else:
+            np.testing.assert_allclose(frame.T_world_camera, writers.make_pose(pose), atol=1e-12)
+    assert np.isnan(sequence.ground_truth()[3]).all()
+    published = sequence.as_published()
+    assert [frame.timestamp for frame in published] == [10.00, 10.10, 11.00]
+    assert [frame.index for frame in published] == [0, 1, 2] and len(sequence) == 5
+    assert [frame.depth_timestamp for frame in published] == [9.97, 10.13, 11.06]
+    np.testing.assert_allclose(published.ground_truth(), [writers.make_pose(i) for i in (0, 1, 3)], atol=1e-12)
+    np.testing.assert_array_equal(published[1].rgb, writers.make_rgb(2))
 
 
 def test_tum_limit_of_association(tmp_path):
     """TUM: 0.09 s to the nearest pose is too much."""
     folder = writers.write_tum(tmp_path, times=[1.0, 2.0], depth_times=[1.0, 2.0], pose_times=[1.0, 2.09])
-    assert [frame.timestamp for frame in open_sequence(folder, camera=writers.CAMERA)] == [1.0]
+    sequence = open_sequence(folder, camera=writers.CAMERA)
+    assert [frame.T_world_camera is None for frame in sequence] == [False, True]
+    assert [frame.timestamp for frame in sequence.as_published()] == [1.0]
 
 
 def test_tum_without_poses(tmp_path):
     """TUM: without a pose file depth alone decides; pose.txt stands in for groundtruth.txt."""
     folder = writers.write_tum(tmp_path, times=[1.0, 2.0], depth_times=[1.0, 2.0], pose_times=[1.0])
     (folder / "groundtruth.txt").rename(folder / "pose.txt")
-    assert len(open_sequence(folder, camera=writers.CAMERA)) == 1
+    sequence = open_sequence(folder, camera=writers.CAMERA)
+    assert (len(sequence), len(sequence.as_published())) == (2, 1)
     (folder / "pose.txt").unlink()
     sequence = open_sequence(folder, camera=writers.CAMERA)
-    assert len(sequence) == 2 and sequence.ground_truth() is None
+    assert len(sequence) == len(sequence.as_published()) == 2 and sequence.ground_truth() is None
+
+
+def test_tum_camera_from_the_name_that_was_typed(tmp_path):
+    """TUM: a link's own name tells the camera and names the sequence, before that of the folder it leads to."""
+    target = _write_tum_640(tmp_path / "freiburg3_desk")
+    (tmp_path / "fr1_desk").symlink_to(target)
+    linked = open_sequence(tmp_path / "fr1_desk")
+    assert linked.calibration.source == "built-in camera tum_fr1" and linked.name == "fr1_desk"
+    (tmp_path / "kitchen").symlink_to(target)
+    assert open_sequence(tmp_path / "kitchen").calibration.source == "built-in camera tum_fr3"
+
+
+def _write_tum_640(folder):
+    writers.write_tum(folder, times=[], depth_times=[], pose_times=[1.0])
+    for kind, image in (("rgb", np.zeros((480, 640, 3), np.uint8)), ("depth", np.full((480, 640), 5000, np.uint16))):
+        writers.write_image(folder / kind / "1.png", image)
+        (folder / f"{kind}.txt").write_text(f"1.0 {kind}/1.png\n")
+    return folder
 
 
 @pytest.mark.parametrize(
@@ -115,11 +148,7 @@ def test_tum_camera_from_name(tmp_path, name, focal):
     """TUM: the folder's name tells the camera. Frames lose the border that undistortion blackens; as the paper's code
     takes them they are resized to 512 x 384 and lose 8 pixels on each side.
     """
-    folder = writers.write_tum(tmp_path / name, times=[], depth_times=[], pose_times=[1.0])
-    for kind, image in (("rgb", np.zeros((480, 640, 3), np.uint8)), ("depth", np.full((480, 640), 5000, np.uint16))):
-        writers.write_image(folder / kind / "1.png", image)
-        (folder / f"{kind}.txt").write_text(f"1.0 {kind}/1.png\n")
-    sequence = open_sequence(folder)
+    sequence = open_sequence(_write_tum_640(tmp_path / name))
     size = (640, 480) if name == "fr3_office" else (620, 460)
     for frames, (width, height), scale in ((sequence, size, 1.0), (sequence.as_published(), (496, 368), 0.8)):
         assert (frames.intrinsics.width, frames.intrinsics.height) == (width, height)
@@ -220,10 +249,10 @@ def test_azure_recorder_camera(tmp_path):
 def test_redwood(tmp_path):
     """Redwood: the optimised trajectory comes before the first one."""
     folder = writers.write_color_depth(tmp_path, "image")
-    writers.write_log(folder / "test_scene/trajectory.log", {i: np.eye(4) for i in range(3)})
-    np.testing.assert_array_equal(
-        open_sequence(folder, camera=writers.CAMERA).ground_truth(), np.stack([np.eye(4)] * 3)
-    )
+    others = {i: writers.make_pose(i + 5) for i in range(3)}
+    writers.write_log(folder / "test_scene/trajectory.log", others)
+    truth = open_sequence(folder, camera=writers.CAMERA).ground_truth()
+    np.testing.assert_array_equal(truth, np.stack(list(others.values())))
     poses = {i: writers.make_pose(i) for i in range(3)}
     writers.write_log(folder / "test_slac/0.050/optimized_trajectory_slac.log", poses)
     sequence = open_sequence(folder, camera=writers.CAMERA)

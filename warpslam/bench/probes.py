@@ -167,7 +167,7 @@ def _open(job: Job) -> tuple[RgbdSequence, Config, Iterator[tuple[Frame, np.ndar
     def frames() -> Iterator[tuple[Frame, np.ndarray]]:
         for index in select_frames(sequence, slice(*request.frames)):
             frame = sequence[index]
-            pose = frame.T_world_camera if given is None else given.at(frame.timestamp)
+            pose = frame.T_world_camera if given is None else given.of(frame)
             if pose is not None and np.isfinite(pose).all():
                 yield frame, pose
 

@@ -21,6 +21,7 @@ from warpslam.runtime.stopping import Terminated, terminable, was_terminated
 
 COMMANDS = {
     "run": ("run", "trajectory and coloured mesh of a folder of RGB-D frames"),
+    "live": ("live", "SLAM on a camera that is plugged in; ctrl-C ends it and writes all"),
     "demo": ("run", "SLAM in a small rendered room; needs no data"),
     "batch": ("batch", "run many sequences, and go on where an earlier batch stopped"),
     "bench": ("bench", "the paper's studies on your sequences: tables, plots and a page"),
@@ -30,8 +31,9 @@ COMMANDS = {
     ),
     "eval": ("evaluate", "trajectory and reconstruction errors of a run"),
     "report": ("report", "HTML report of a run, or a comparison of several"),
-    "render": ("render", "a frame beside what the map renders at its pose, as PNG"),
+    "render": ("render", "a frame beside what the map renders at its pose, or the mesh along a path as a film"),
     "mesh": ("mesh", "extract the mesh of a run again"),
+    "export": ("export", "the trajectory of a run in the format of another tool"),
     "calibrate-time": (
         "calibrate_time",
         "delay of depth and readout time of a camera, from a recording in which it moves",

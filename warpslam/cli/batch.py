@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
@@ -86,7 +87,7 @@ def _batch(options: argparse.Namespace) -> int:
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
     request = RunRequest(
-        source=Source("", options.dataset, options.camera),
+        source=Source("", options.dataset, options.camera, topics=options.topics),
         frames=slice_of(options.frames),
         config=read_config(options),
         preset=options.preset,
@@ -98,9 +99,13 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
         checkpoint_every=options.checkpoint_every or None,
     )
     common = Job("", request)
-    paths = [Path(folder).expanduser().resolve() for folder in options.folders]
+    paths = [Path(os.path.abspath(Path(folder).expanduser())) for folder in options.folders]
     jobs = [
-        Job(path.name, replace(request, source=Source(str(path), options.dataset, options.camera))) for path in paths
+        Job(
+            path.name,
+            replace(request, source=Source(str(path), options.dataset, options.camera, topics=options.topics)),
+        )
+        for path in paths
     ]
     if options.manifest:
         jobs += read_manifest(options.manifest, common)

@@ -35,7 +35,7 @@ def add(commands: Any) -> None:
 
 def _calibrate(options: argparse.Namespace) -> int:
     check_device(options.device)
-    sequence = open_sequence(options.folder, dataset=options.dataset, camera=options.camera)
+    sequence = open_sequence(options.folder, dataset=options.dataset, camera=options.camera, topics=options.topics)
     if not isinstance(sequence, FileSequence):
         raise ConfigError(f"{sequence.name} is no recording on disk")
     selected = select_frames(sequence, options.frames)

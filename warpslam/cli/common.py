@@ -35,6 +35,9 @@ def add_sequence_options(parser: argparse.ArgumentParser) -> None:
 def add_format_options(parser: argparse.ArgumentParser) -> None:
     """How to read a folder."""
     parser.add_argument("--dataset", default="auto", help="format of the folder (default: told from its file names)")
+    parser.add_argument(
+        "--topics", metavar="COLOR,DEPTH[,POSES]", help="topics of a bag (default: told from their names)"
+    )
     parser.add_argument("--camera", metavar="FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE", help="camera, not the dataset's")
 
 
@@ -49,12 +52,31 @@ def add_run_options(parser: argparse.ArgumentParser, output: str = "run folder (
     parser.add_argument("-o", "--output", metavar="DIR", help=output)
 
 
-def add_slam_options(parser: argparse.ArgumentParser) -> None:
-    """Options of everything that runs SLAM."""
+class Overrides(argparse.Action):
+    """Takes KEY=VALUE words; one that is none is most likely the folder, which this option must not swallow."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        """Add them to those that are there."""
+        takes_a_folder = any(action.dest in ("folder", "folders") for action in parser._actions)
+        for value in values:
+            if "=" not in value and takes_a_folder:
+                parser.error(
+                    f"{option_string} {value}: is no KEY=VALUE; if it is the folder, name it before {option_string}"
+                )
+        setattr(namespace, self.dest, [*getattr(namespace, self.dest), *values])
+
+
+def add_set_option(parser: argparse.ArgumentParser) -> None:
+    """Single settings."""
     parser.add_argument(
-        "--set", dest="overrides", nargs="+", action="extend", default=[], metavar="KEY=VALUE",
+        "--set", dest="overrides", nargs="+", action=Overrides, default=[], metavar="KEY=VALUE",
         help="settings, such as mapping.iterations=30",
     )  # fmt: skip
+
+
+def add_slam_options(parser: argparse.ArgumentParser) -> None:
+    """Options of everything that runs SLAM."""
+    add_set_option(parser)
     parser.add_argument("--decoders", metavar="FILE", help="decoder checkpoint (default: the package's own)")
     add_device_option(parser)
     parser.add_argument("--seed", type=int, default=0, help="seed of every random choice (0)")

@@ -20,10 +20,12 @@ def add(commands: Any) -> None:
         "--refine", type=int, nargs="?", const=_DEFAULT_ROUNDS, default=0, metavar="N",
         help=f"refine the whole map before, in N more rounds ({_DEFAULT_ROUNDS}); the saved map stays as it is",
     )  # fmt: skip
+    mesh.add_argument("--faces", type=int, metavar="N", help="reduce the mesh to about N faces (fast-simplification)")
+    mesh.add_argument("--points", action="store_true", help="write the vertices and their colours alone, as .ply")
     add_device_option(mesh)
     mesh.add_argument(
         "-o", "--output", metavar="FILE",
-        help=".ply or .glb file (default: RUN/mesh.ply, or RUN/mesh_forecast.ply with --forecast)",
+        help=".ply, .glb, .obj or .stl file (default: RUN/mesh.ply, or RUN/mesh_forecast.ply with --forecast)",
     )  # fmt: skip
 
 
@@ -39,7 +41,11 @@ def _mesh(options: argparse.Namespace) -> int:
         options.device,
         forecast=options.forecast,
         refinement_rounds=options.refine,
+        faces=options.faces,
+        points_only=options.points,
     )
-    extra = f", {mesh.metadata['forecast_faces']} of them forecast" if options.forecast else ""
+    extra = (
+        f", {mesh.metadata['forecast_faces']} of them forecast" if options.forecast and options.faces is None else ""
+    )
     print(f"{path}: {len(mesh.vertices)} vertices, {len(mesh.faces)} faces{extra}")
     return 0

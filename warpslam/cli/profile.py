@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import Any
 
@@ -65,7 +66,9 @@ def _input(options: argparse.Namespace) -> tuple[RgbdSequence, Config]:
     if options.folder == "demo":
         preset, overrides = options.preset or demo.PRESET, [*demo.OVERRIDES, *options.overrides]
         return open_source(Source.demo()), Config.from_preset(preset, overrides)
-    source = Source(str(Path(options.folder).expanduser().resolve()), options.dataset, options.camera)
+    source = Source(
+        os.path.abspath(Path(options.folder).expanduser()), options.dataset, options.camera, topics=options.topics
+    )
     sequence = open_source(source)
     config = Config.from_preset(options.preset or sequence.preset, options.overrides)
     return as_configured(sequence, config), config

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from contextlib import contextmanager
 from dataclasses import replace
@@ -36,7 +37,7 @@ from warpslam.runs.request import RunRequest, Source
 from warpslam.synthetic import demo
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from warpslam.runs.record import Progress, RunResult
     from warpslam.runtime.compilation import ModuleProgress
@@ -102,10 +103,10 @@ def _run(options: argparse.Namespace) -> int:
             raise ConfigError("--preset, --config and --decoders do not go with --map, which has all three; use --set")
         path = Path(map_).expanduser().resolve()
         map_ = str(RunFolder(path).map if path.is_dir() else path)
-    folder = str(Path(options.folder).expanduser().resolve())
+    folder = os.path.abspath(Path(options.folder).expanduser())  # a link keeps its name, which may tell the camera
     request = replace(
         _common(options),
-        source=Source(folder, options.dataset, options.camera, options.command_line),
+        source=Source(folder, options.dataset, options.camera, options.command_line, options.topics),
         frames=slice_of(options.frames),
         config=config,
         preset=options.preset,
@@ -173,8 +174,16 @@ def _common(options: argparse.Namespace) -> RunRequest:
 
 def _execute(request: RunRequest, options: argparse.Namespace, **keywords: Any) -> int:
     quiet_warp()
-    with warnings_on_stderr(), _display() as display:
-        result = run(request, options.output, observer=display, overwrite=options.overwrite, **keywords)
+    with warnings_on_stderr():
+        return show_run(
+            lambda observer: run(request, options.output, observer=observer, overwrite=options.overwrite, **keywords)
+        )
+
+
+def show_run(start: Callable[[Observer], RunResult]) -> int:
+    """Start a run, show how it goes and what came of it; returns the exit code."""
+    with _display() as display:
+        result = start(display)
     _print_summary(result)
     return EXIT_INTERRUPTED if result.status == INTERRUPTED else 0
 
@@ -242,7 +251,7 @@ def _compiling(module: ModuleProgress) -> str:
 
 def _figures(progress: Progress) -> str:
     result = progress.result
-    parts = [f"{progress.fps:.2f} fps", *(f"{name} {value:.3g}" for name, value in result.losses.items())]
+    parts = [f"{progress.fps:.2f} fps"]
     if progress.ate_rmse is not None:
         parts.append(f"ATE {100 * progress.ate_rmse:.2f} cm")
     if result.status != FrameStatus.OK:

@@ -5,6 +5,8 @@ Defaults are the published ones for Replica (released code; paper A.6) where not
 
 from __future__ import annotations
 
+import difflib
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +19,7 @@ from warpslam.config.presets import PRESETS
 from warpslam.errors import ConfigError, brief
 from warpslam.reading import load_yaml, read_text
 
+_LENGTH = re.compile(r"\[(m|m\^2)\]")
 _FOLLOW_GIVEN_POSES = ("bundle_adjustment", "depth_start")  # of the mapping group, see `Config.resolved`
 
 
@@ -236,7 +239,7 @@ class DirectConfig(_Group):
     window: int = Field(7, ge=0, le=20, description="keyframes refined when one is added; 0 = none")
     window_iterations: int = Field(2, ge=1, le=20, description="iterations of that")
     window_features: bool = Field(
-        False, description="whether features that these keyframes have in common join their refinement"
+        True, description="whether features that these keyframes have in common join their refinement"
     )
     keyframe_overlap: float = Field(
         0.75, gt=0, lt=1, description="a frame becomes a keyframe where it shares less with the reference"
@@ -367,6 +370,13 @@ class Config(_Group):
         description="depth that is taken before or after colour, and rows that are taken one after the other, are "
         "corrected for where stamps or the camera tell; off = every pixel is taken at once (paper)",
     )
+    scene_scale: float = Field(
+        1.0,
+        ge=1e-3,
+        le=1e3,
+        description="size of the scene beside that of a room: all settings that are lengths are multiplied by it; 0.1 "
+        "suits an object on a table, 5 a hall",
+    )
     decoders: str | None = Field(None, description="decoder checkpoint; the package's own when empty")
 
     @classmethod
@@ -379,8 +389,7 @@ class Config(_Group):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            lines = [f"{'.'.join(map(str, e['loc']))}: {e['msg']} (got {e['input']!r})" for e in error.errors()]
-            raise ConfigError(f"{source}: " + "; ".join(lines)) from None
+            raise ConfigError(f"{source}: " + "; ".join(map(_fault, error.errors()))) from None
 
     @classmethod
     def from_preset(cls, name: str = "default", overrides: Sequence[str] | None = None) -> Config:
@@ -392,7 +401,7 @@ class Config(_Group):
         if name not in PRESETS:
             raise ConfigError(f"preset {name!r} is unknown; choose one of {', '.join(sorted(PRESETS))}")
         values = _merged({}, PRESETS[name], *map(parse_override, overrides or []))
-        return cls.from_dict(values, source=f"preset {name}")
+        return cls.from_dict(values, source="--set" if overrides else f"preset {name}")
 
     @classmethod
     def from_file(cls, path: str | Path, overrides: Sequence[str] | None = None) -> Config:
@@ -435,7 +444,27 @@ class Config(_Group):
             "bundle_adjustment": mapping.bundle_adjustment and not given and self.tracking.optimizer != "direct",
             "depth_start": given if mapping.depth_start is None else mapping.depth_start,
         }
-        return self.model_copy(update={"mapping": mapping.model_copy(update=derived)})
+        return self.model_copy(update={"mapping": mapping.model_copy(update=derived)})._at_scale()
+
+    def _at_scale(self) -> Config:
+        """These settings with every length multiplied by ``scene_scale``, which is then 1."""
+        scale = self.scene_scale
+        if scale == 1.0:
+            return self
+        changes: dict[str, Any] = {"scene_scale": 1.0}
+        for name, group in ((name, getattr(self, name)) for name in type(self).model_fields):
+            if isinstance(group, _Group):
+                fields = type(group).model_fields.items()
+                units = {field: _LENGTH.search(info.description or "") for field, info in fields}
+                powers = {field: 2 if unit[1] == "m^2" else 1 for field, unit in units.items() if unit}
+                lengths = {field: getattr(group, field) * scale**power for field, power in powers.items()}
+                changes[name] = group.model_copy(update=lengths)
+        tracking, imap = changes["tracking"], changes["imap"]
+        # The turn of a pose keeps its rate, and the network its units.
+        factor = tracking.rotation_rate_factor / scale
+        changes["tracking"] = tracking.model_copy(update={"rotation_rate_factor": factor})
+        changes["imap"] = imap.model_copy(update={"scale": imap.scale / scale})
+        return self.model_copy(update=changes)
 
     def with_files(self, decoders: str | None = None, poses: str | Path | None = None) -> Config:
         """These settings for a run that is given a decoder checkpoint, or a trajectory whose poses are taken as they
@@ -475,3 +504,19 @@ def _merged(*parts: dict[str, Any]) -> dict[str, Any]:
     for part in parts:
         merge(values, part)
     return values
+
+
+def _fault(error: Any) -> str:
+    """One fault of settings, in words; a name that is nearly one of ours is corrected."""
+    name = ".".join(map(str, error["loc"]))
+    if error["type"] != "extra_forbidden":
+        return f"{name}: {error['msg']} (got {error['input']!r})"
+    kinds = {field: info.annotation for field, info in Config.model_fields.items()}
+    known = [field for field, kind in kinds.items() if not (isinstance(kind, type) and issubclass(kind, _Group))]
+    for field, kind in kinds.items():
+        if isinstance(kind, type) and issubclass(kind, _Group):
+            known += [f"{field}.{inner}" for inner in kind.model_fields]
+    # A name without its group is as common as a slip of the pen.
+    near = [option for option in known if option.rsplit(".", 1)[-1] == name.rsplit(".", 1)[-1]]
+    near = near or difflib.get_close_matches(name, known, n=1)
+    return f"no setting {name}" + (f"; did you mean {' or '.join(near)}?" if near else "")

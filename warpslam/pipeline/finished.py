@@ -20,7 +20,7 @@ from warpslam.evaluation import (
     trajectory_metrics,
 )
 from warpslam.frames import FrameStatus
-from warpslam.meshing import check_mesh_path, write_mesh
+from warpslam.meshing import check_mesh_path, point_cloud, simplified, write_mesh, write_points
 from warpslam.pipeline.results import render_panel, size_of_mesh
 from warpslam.pipeline.setup import as_configured, load_slam, open_source
 from warpslam.poses import transform_poses
@@ -145,7 +145,7 @@ def evaluate_run(
         known = np.where(paired[:, None, None], truth_poses[partner], poses)
         mesh = folder.require(folder.mesh, "see metrics.json for why the run made none")
         sequence = as_configured(open_source(folder.read_source()), folder.read_config())
-        indices = _frame_indices(folder, len(times))
+        indices = frame_indices(folder, len(times))
         results = evaluate_mesh(
             mesh, load_mesh(truth_mesh), sequence, indices, known, protocols=protocols, device=device
         )
@@ -161,7 +161,7 @@ def evaluate_run(
 def _rendering_metrics(folder: RunFolder, poses: np.ndarray, count: int, device: str | None) -> dict[str, Any]:
     slam = load_slam(folder, device)
     sequence = as_configured(open_source(folder.read_source()), folder.read_config())
-    indices = _frame_indices(folder, len(poses))
+    indices = frame_indices(folder, len(poses))
     chosen = spread(len(poses), count)
     return rendering_metrics([render_panel(slam, sequence[indices[n]], poses[n]) for n in chosen])
 
@@ -183,7 +183,7 @@ def render_frame(folder: RunFolder, index: int, output: str | Path | None = None
     sequence = open_source(folder.read_source())
     if not 0 <= index < len(sequence):
         raise InputError(f"frame {index} is not in {sequence.name}, which has frames 0 to {len(sequence) - 1}")
-    used = _frame_indices(folder, len(poses))
+    used = frame_indices(folder, len(poses))
     if index not in used:
         raise InputError(f"frame {index} was not used by the run {folder.path}, so it has no pose; choose another one")
     path = Path(output) if output is not None else folder.path / f"render_{index:06d}.png"
@@ -201,34 +201,44 @@ def extract_mesh(
     *,
     forecast: bool = False,
     refinement_rounds: int = 0,
+    faces: int | None = None,
+    points_only: bool = False,
 ) -> tuple[trimesh.Trimesh, Path]:
     """Extract the mesh of the final map and write it. The map itself stays as the run left it.
 
     Args:
         folder: Run.
         voxel: Edge of a marching-cubes cell [m]; None for the setting of the run.
-        output: File to write, .ply or .glb; None for mesh.ply in the run folder, mesh_forecast.ply with a forecast.
+        output: File to write, .ply, .glb, .obj or .stl; None for mesh.ply in the run folder, or
+            mesh_forecast.ply with a forecast.
         device: Warp device.
         forecast: Add what the coarse level suggests where nothing was seen, in cyan.
         refinement_rounds: Rounds of the global refinement before that.
+        faces: Reduce the mesh to about so many; None for all.
+        points_only: Write its vertices and their colours alone.
 
     Raises:
         ConfigError: The method of the run has no refinement, or forecasts nothing.
         DatasetError: The run saved no map.
         InputError: The map can't be refined.
         MeshError: There is no surface, or the file can't be written.
+        MissingDependencyError: Fewer faces need the package fast-simplification.
     """
     path = check_mesh_path(output if output is not None else folder.forecast_mesh if forecast else folder.mesh)
     slam = load_slam(folder, device)
     if refinement_rounds > 0:
         slam.refine(refinement_rounds)
     mesh = slam.mesh(voxel, forecast=forecast)
-    written = write_mesh(mesh, path)
+    if faces is not None:
+        forecast_faces = mesh.metadata.get("forecast_faces")
+        mesh = simplified(mesh, faces)
+        mesh.metadata["forecast_faces"] = forecast_faces
+    written = write_points(point_cloud(mesh), path) if points_only else write_mesh(mesh, path)
     note_changed(folder, written)
     return mesh, written
 
 
-def _frame_indices(folder: RunFolder, count: int) -> list[int]:
+def frame_indices(folder: RunFolder, count: int) -> list[int]:
     """Number in its sequence of each of the ``count`` frames in trajectory.tum."""
     timing = read_json(folder.require(folder.timing, "so it is unknown which frames it used"))
     try:

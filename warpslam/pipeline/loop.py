@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -18,6 +19,7 @@ from warpslam.pipeline.read_ahead import ReadAhead
 from warpslam.pipeline.results import trajectory_of
 from warpslam.runs.metrics import FoundTiming
 from warpslam.runs.record import Progress
+from warpslam.sequences.base import EndOfFrames
 
 if TYPE_CHECKING:
     from warpslam.frames import FrameResult
@@ -29,6 +31,28 @@ if TYPE_CHECKING:
     from warpslam.sequences.base import Frame, RgbdSequence
 
 log = logging.getLogger(__name__)
+_RECENT = 40  # frames, some calls of mapping among them
+
+
+class RecentRate:
+    """Frames a second of the last frames, which tell how long the others will take. The first frame, with the first
+    mapping, is like no other, and counts until there is a second.
+
+    Args:
+        start: Clock before the first frame [s].
+    """
+
+    def __init__(self, start: float) -> None:
+        self._ends = deque([start], maxlen=_RECENT + 1)
+        self._count = 0
+
+    def after_frame(self, now: float) -> float:
+        """The rate [1/s] when the clock shows ``now`` [s] at the end of a frame."""
+        self._count += 1
+        self._ends.append(now)
+        if self._count == 2:
+            self._ends.popleft()
+        return (len(self._ends) - 1) / max(self._ends[-1] - self._ends[0], 1e-9)
 
 
 @dataclass(eq=False)
@@ -67,7 +91,7 @@ class FrameLoop:
         Raises:
             DatasetError: Not a single frame could be used.
         """
-        done_before, start = len(self.record.results), time.perf_counter()
+        rate = RecentRate(time.perf_counter())
         self.checkpoints.before_frames(self.record, self.slam)
         for frame in self._readable_frames():
             truth = _true_pose(frame)
@@ -84,8 +108,7 @@ class FrameLoop:
             if result.sensor_timing:
                 found = FoundTiming.model_validate(found_timing(self.record, self.sequence))
                 log.info("the camera's timing was estimated: %s", found.text)
-            fps = (len(self.record.results) - done_before) / max(time.perf_counter() - start, 1e-9)
-            self.observer.frame(self._progress(result, fps))
+            self.observer.frame(self._progress(result, rate.after_frame(time.perf_counter())))
             self.checkpoints.after_frame(frame, self.record, self.slam)
         self._check_that_one_was_used()
 
@@ -105,8 +128,11 @@ class FrameLoop:
                 before, last = last, frame.timestamp
                 if last <= before:
                     raise DatasetError(f"its time {last:.6f} s is not after {before:.6f} s, that of the frame before")
-                if self.given is not None and self.given.at(frame.timestamp) is None:
+                if self.given is not None and self.given.of(frame) is None:
                     raise DatasetError(f"{self.given.path} has no pose for {frame.timestamp:.3f} s")
+            except EndOfFrames:
+                record.position -= 1
+                return
             except DatasetError as error:
                 record.leave_out(index, str(error))
                 log.warning("frame %d left out: %s", index, error)
@@ -116,18 +142,19 @@ class FrameLoop:
     def _given_pose(self, frame: Frame, truth: np.ndarray) -> np.ndarray | None:
         """The pose (4, 4) that the method is told; NaN makes it skip the frame, and the run goes on."""
         if self.given is not None:
-            return self.given.at(frame.timestamp)
+            return self.given.of(frame)
         if self.poses_are_wanted:
             return truth
         return truth if self.world_is_known and np.isfinite(truth).all() else None
 
     def _progress(self, result: FrameResult, fps: float) -> Progress:
-        record, done = self.record, len(self.record.results)
+        record, processed = self.record, len(self.record.results)
         # Of all poses so far, and so dearer by the frame: asked anew when there are a twentieth more, and at the end.
-        if done >= self._next_ate or record.position == len(self.selected):
-            self._next_ate = done + 1 + done // 20
+        if processed >= self._next_ate or record.position == len(self.selected):
+            self._next_ate = processed + 1 + processed // 20
             self._ate = ate(trajectory_of(self.slam, record).poses, record.truth).rmse if record.has_truth else None
-        return Progress(done + len(record.left_out), len(self.selected), result, self._ate, fps)
+        done = processed + len(record.left_out)
+        return Progress(done, done if self.sequence.is_live else len(self.selected), result, self._ate, fps)
 
     def _check_that_one_was_used(self) -> None:
         name, results = self.sequence.name, self.record.results

@@ -16,7 +16,7 @@ class ReadAhead:
     """Reads frames of a sequence in the order given, one ahead of the one asked for; used in a ``with`` block.
 
     Args:
-        sequence: Input; one that is rendered by kernels is not read ahead.
+        sequence: Input; one that is rendered by kernels, or live, is not read ahead.
         indices: Frames in the order in which `take` returns them.
     """
 
@@ -39,9 +39,10 @@ class ReadAhead:
 
         Raises:
             DatasetError: It can't be read; the next call goes on with the one after it.
+            EndOfFrames: A live sequence has none any more.
         """
         number, self._taken = self._taken, self._taken + 1
-        if not self.sequence.can_read_ahead:
+        if self.sequence.is_live or not self.sequence.can_read_ahead:
             return self.sequence[self.indices[number]]
         current = self._ahead or self._start(number)
         self._ahead = self._start(number + 1) if number + 1 < len(self.indices) else None

@@ -261,13 +261,27 @@ class Run:
         log.info("%s: %d of %d frames, %s", self.sequence.name, len(self.selected), len(self.sequence), self.selected)
 
     def _check_input(self) -> None:
+        if self.sequence.is_live:
+            return
         # Poses of a file take the place of the sequence's own, which then matter for the errors alone.
         poses_matter = self.config.tracking.use_given_poses and self.given is None
         if poses_matter and self.sequence.ground_truth() is None and self._first_pose() is None:
-            raise ConfigError(f"tracking.use_given_poses is on, but {self.sequence.name} has no poses; switch it off")
+            raise ConfigError(
+                f"tracking.use_given_poses is on, but {self.sequence.name} has no poses; give them with --poses FILE, "
+                "or leave that setting out"
+            )
         with self.record.clock("checking"):
+            given = None
+            if self.given is not None:
+                self.given = self.given.fitted_to(self.sequence, self.selected)
+                given = self.given.of_frames(self.sequence, self.selected)
             findings = check_sequence(
-                self.sequence, self.selected, max_depth=self.config.grid.max_depth, poses_matter=poses_matter
+                self.sequence,
+                self.selected,
+                max_depth=self.config.grid.max_depth,
+                poses_matter=poses_matter,
+                given_poses=given,
+                given_path=None if self.given is None else self.given.path,
             )
         bad = [finding for finding in findings if finding.severity != OK]
         self.metrics.fill({"input_checks": [vars(finding) for finding in bad]})
@@ -313,8 +327,12 @@ class Run:
             checkpoints=self.checkpoints,
             observer=self.observer,
         )
-        with self.record.clock("frames"):
-            loop.run()
+        try:
+            with self.record.clock("frames"):
+                loop.run()
+        finally:
+            if self.sequence.is_live:
+                self.selected = range(self.record.position)
 
     def _finish_map(self) -> None:
         assert self.slam is not None

@@ -40,7 +40,7 @@ def open_source(source: Source) -> RgbdSequence:
     """
     if source.is_demo:
         return demo.demo_sequence()
-    return open_sequence(source.path or "", dataset=source.dataset, camera=source.camera)
+    return open_sequence(source.path or "", dataset=source.dataset, camera=source.camera, topics=source.topics)
 
 
 def as_configured(sequence: RgbdSequence, config: Config | None) -> RgbdSequence:
@@ -67,10 +67,12 @@ def resolve(request: RunRequest, sequence: RgbdSequence) -> RunRequest:
         ConfigError: Something asked for does not go together, or a setting is out of range.
         CheckpointError: The settings of a map can't be read.
     """
-    selected = select_frames(sequence, slice(*request.frames))
     check_checkpoint_settings(request.checkpoint_every, request.map, request.localize_only, request.method)
     if request.map is not None and request.config is None and request.preset is None:
         request = replace(request, config=saved_config(Path(request.map)))
+    # The paper's code leaves frames out, and counts those that are left.
+    frames = as_configured(sequence, request.settings(sequence.preset))
+    selected = select_frames(frames, slice(*request.frames))
     return request.resolved(sequence.preset, selected, device_name(request.device))
 
 

@@ -40,6 +40,9 @@ class Source:
     command: str | None = None
     """Command line that started the run; None if a program did."""
 
+    topics: str | None = None
+    """Topics of a bag, "COLOR,DEPTH" or "COLOR,DEPTH,POSES"; None to tell them from their names."""
+
     @classmethod
     def demo(cls, command: str | None = None) -> Source:
         """The built-in sequence."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
+import os
 from pathlib import Path
 
-from warpslam.errors import DatasetError, brief
-from warpslam.reading import YAML_LIMIT, read_text
-from warpslam.sequences.calibration import Calibration, find_calibration, has_own_camera
 from warpslam.sequences.files import FileSequence
-from warpslam.sequences.image_files import list_images
+from warpslam.sequences.image_files import DEPTH_SUFFIXES, list_images
+from warpslam.sequences.pairing import pair
+from warpslam.sequences.recorder_files import find_recorded
 from warpslam.sequences.redwood import find_log_poses
 
 
@@ -23,33 +22,20 @@ class AzureSequence(FileSequence):
     preset = "apartment"
 
     def __init__(self, folder: Path, camera: str | None = None) -> None:
-        rgb_files = list_images(folder / "color")
-        recorded = folder / "intrinsic.json"
-        if recorded.is_file() and camera is None and not has_own_camera(folder):
-            calibration = _from_intrinsic_json(recorded)
-        else:
-            resolved = folder.resolve()
-            is_apartment = "apartment" in f"{resolved.parent.name}/{resolved.name}".lower()
-            remedy = "Only a folder named Apartment has a built-in camera. "
-            calibration = find_calibration(folder, camera, "azure" if is_apartment else None, remedy)
+        pairs = pair(folder, list_images(folder / "color"), list_images(folder / "depth", suffixes=DEPTH_SUFFIXES))
+        path = Path(os.path.abspath(folder))
+        is_apartment = "apartment" in f"{path.parent.name}/{path.name}".lower()
+        remedy = "Only a folder named Apartment has a built-in camera. "
+        calibration = find_recorded(
+            folder, camera, "azure" if is_apartment else None, pairs.rgb_files, pairs.depth_files, remedy
+        )
+        patterns = ("scene/trajectory.log", "trajectory.log", "*.log")
+        poses, remarks = find_log_poses(folder, patterns, pairs.rgb_count)
         super().__init__(
             folder,
             calibration,
-            rgb_files,
-            list_images(folder / "depth", suffixes=(".png",)),
-            poses=find_log_poses(folder, ("scene/trajectory.log", "trajectory.log", "*.log"), len(rgb_files)),
+            pairs.rgb_files,
+            pairs.depth_files,
+            poses=pairs.poses(poses),
+            remarks=(*pairs.remarks, *remarks),
         )
-
-
-def _from_intrinsic_json(path: Path) -> Calibration:
-    """Camera of a file by Open3D: width, height and the column-major 3x3 intrinsic_matrix."""
-    try:
-        fields = json.loads(read_text(path, YAML_LIMIT))
-        fx, _, _, _, fy, _, cx, cy, _ = fields["intrinsic_matrix"]
-        size = {"width": fields["width"], "height": fields["height"]}
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise DatasetError(
-            f"{path}: no camera of Open3D (width, height, intrinsic_matrix with 9 numbers): {brief(repr(error))}; "
-            "correct it or write a camera.yaml"
-        ) from error
-    return Calibration.from_fields({"fx": fx, "fy": fy, "cx": cx, "cy": cy, **size, "depth_scale": 1000}, str(path))

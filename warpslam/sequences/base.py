@@ -29,6 +29,24 @@ class Frame:
     """Time of the depth image [s], where it has one of its own."""
 
 
+@dataclass(frozen=True)
+class Remark:
+    """What a reader noticed in opening a sequence, for `warpslam check` and for the log of a run."""
+
+    check: str
+    """What it is about."""
+    message: str
+    """What is so, and where."""
+    remedy: str = ""
+    """What to do or type."""
+    is_fine: bool = False
+    """Nothing is lost by it; it is only said."""
+
+
+class EndOfFrames(Exception):
+    """A camera that is running has ended; a run that reads it is over, and writes its results."""
+
+
 class RgbdSequence(ABC):
     """A random-access RGB-D sequence.
 
@@ -37,6 +55,8 @@ class RgbdSequence(ABC):
     preset: Name of the settings that suit the sequence (see `warpslam.config.PRESETS`).
     timing: When the pixels of the frames, as returned, are taken.
     can_read_ahead: Whether a thread may read a frame while the one before is worked on.
+    remarks: What was noticed in opening it.
+    is_live: Frames come one after another from a camera that is running, and end some time; not read ahead.
     """
 
     name: str
@@ -44,6 +64,8 @@ class RgbdSequence(ABC):
     preset: str = "default"
     timing: SensorTiming = ONE_MOMENT
     can_read_ahead: bool = True
+    remarks: tuple[Remark, ...] = ()
+    is_live: bool = False
 
     @abstractmethod
     def __len__(self) -> int: ...

@@ -8,16 +8,22 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from warpslam.camera import ONE_MOMENT, Intrinsics, SensorTiming
-from warpslam.errors import ConfigError, DatasetError, brief
+from warpslam.errors import ConfigError, DatasetError, InputError, brief
+from warpslam.poses import check_transform
 from warpslam.reading import YAML_LIMIT, load_yaml, read_bytes
+from warpslam.sequences.registration import ColorCamera
 
 CAMERA_FIELDS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale")
 CAMERA_FILE = "camera.yaml"
 _MAX_SIZE = 16384  # [pixels], what OpenCV warps without trouble
 _OPTIONAL_FIELDS = (
-    "distortion", "depth_distorted", "resize", "crop", "published_resize", "published_crop", "depth_delay", "readout"
+    "distortion", "depth_distorted", "resize", "crop", "published_resize", "published_crop", "depth_delay", "readout",
+    "along_ray", "color", "T_color_depth",
 )  # fmt: skip
+_COLOR_FIELDS = (*CAMERA_FIELDS[:-1], "distortion")
 _DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 
 
@@ -45,11 +51,24 @@ class Calibration:
     """When the pixels of the stored images are taken."""
     source: str = "camera"
     """Where the numbers come from, for messages."""
+    along_ray: bool = False
+    """Whether depth is stored as the distance along the ray, not along the optical axis."""
+    color: ColorCamera | None = None
+    """The camera of the colour images, where it is not that of depth."""
+
+    @property
+    def registered(self) -> Intrinsics:
+        """The one camera into which colour and depth are brought: that of depth, but where colour was taken from
+        another place, since depth can be carried to it and colour can't.
+        """
+        if self.color is None or self.color.shares_centre:
+            return self.stored
+        return self.color.at_resolution_of(self.stored)
 
     @property
     def intrinsics(self) -> Intrinsics:
         """Intrinsics of the frames as returned."""
-        resized = self.stored if self.resize is None else self.stored.scaled(*self.resize)
+        resized = self.registered if self.resize is None else self.registered.scaled(*self.resize)
         return resized.cropped(self.crop) if self.crop else resized
 
     @property
@@ -86,12 +105,19 @@ class Calibration:
         if self.depth_distorted:
             fields["depth_distorted"] = True
         fields |= {name: value for name, value in asdict(self.stored_timing).items() if value}
+        if self.along_ray:
+            fields["along_ray"] = True
+        if self.color is not None:
+            fields["color"] = asdict(self.color.intrinsics)
+            if self.color.distortion:
+                fields["color"]["distortion"] = list(self.color.distortion)
+            fields["T_color_depth"] = list(self.color.T_color_depth)
         return yaml.safe_dump(fields, sort_keys=False, default_flow_style=None)
 
     @classmethod
     def from_fields(cls, fields: dict[str, Any], source: str) -> Calibration:
         """Check and convert a mapping with `CAMERA_FIELDS` and, where wanted, distortion, resize, crop, depth_delay and
-        readout [s].
+        readout [s], along_ray, and the camera of colour as color and T_color_depth.
         """
         unknown = sorted(set(map(str, fields)) - set(CAMERA_FIELDS) - set(_OPTIONAL_FIELDS))
         if unknown:
@@ -121,9 +147,7 @@ class Calibration:
         crop = _whole(_number(fields.get("crop") or 0, "crop", source), "crop", source)
         if crop < 0:
             raise DatasetError(f"{source}: crop = {crop} must be 0 or more pixels")
-        depth_distorted = fields.get("depth_distorted", False)
-        if not isinstance(depth_distorted, bool):
-            raise DatasetError(f"{source}: depth_distorted = {brief(repr(depth_distorted))} must be true or false")
+        depth_distorted, along_ray = (_switch(fields, name, source) for name in ("depth_distorted", "along_ray"))
         published_crop = fields.get("published_crop")
         if published_crop is not None:
             published_crop = _whole(_number(published_crop, "published_crop", source), "published_crop", source)
@@ -141,7 +165,11 @@ class Calibration:
                 published_crop=published_crop,
                 stored_timing=SensorTiming(**seconds),
                 source=source,
+                along_ray=along_ray,
+                color=_color_camera(fields, source),
             )
+            if calibration.color is not None and distortion:
+                raise DatasetError(f"{source}: distortion belongs to colour: move it into color")
             # A crop larger than the image shows here.
             _ = calibration.intrinsics
         except ConfigError as error:
@@ -207,6 +235,33 @@ def _load_yaml(text: bytes, source: str) -> dict[str, Any]:
     if not isinstance(fields, dict):
         raise DatasetError(f"{source}: holds no fields; write one 'name: number' a line for {', '.join(CAMERA_FIELDS)}")
     return fields
+
+
+def _switch(fields: dict[str, Any], name: str, source: str) -> bool:
+    value = fields.get(name, False)
+    if not isinstance(value, bool):
+        raise DatasetError(f"{source}: {name} = {brief(repr(value))} must be true or false")
+    return value
+
+
+def _color_camera(fields: dict[str, Any], source: str) -> ColorCamera | None:
+    """The camera in the field color, and its place in T_color_depth; None without."""
+    given = fields.get("color")
+    if given is None:
+        if fields.get("T_color_depth") is not None:
+            raise DatasetError(f"{source}: T_color_depth needs the camera of colour: add color with {_COLOR_FIELDS}")
+        return None
+    if not isinstance(given, dict) or set(map(str, given)) - set(_COLOR_FIELDS):
+        raise DatasetError(f"{source}: color must have the fields {', '.join(_COLOR_FIELDS)}, and no others")
+    camera = Calibration.from_fields({**given, "depth_scale": 1}, f"{source}: color")
+    transform = _numbers(fields.get("T_color_depth") or np.eye(4).ravel().tolist(), "T_color_depth", source)
+    if len(transform) != 16:
+        raise DatasetError(f"{source}: T_color_depth has {len(transform)} numbers; give the 16 of a 4x4 matrix by rows")
+    try:
+        check_transform(np.array(transform).reshape(4, 4), "T_color_depth")
+    except InputError as error:
+        raise DatasetError(f"{source}: {error}") from error
+    return ColorCamera(camera.stored, camera.distortion, transform)
 
 
 def _number(value: Any, name: str, source: str) -> float:

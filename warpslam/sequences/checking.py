@@ -7,81 +7,41 @@ and is fine. All thresholds are about rooms: a camera for people, surfaces from 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from warpslam.errors import DatasetError, FrameError
+from warpslam.errors import DatasetError, FrameError, MissingDependencyError
 from warpslam.frames import exposure_fault, read_images
 from warpslam.sequences.base import Frame, RgbdSequence
-from warpslam.sequences.files import FileSequence, frame_number
-from warpslam.sequences.pose_convention import CONVENTIONS, EXPECTED, DepthView, agreement, moving_pairs
+from warpslam.sequences.files import FileSequence
+from warpslam.sequences.findings import ERROR as ERROR
+from warpslam.sequences.findings import OK as OK
+from warpslam.sequences.findings import WARNING as WARNING
+from warpslam.sequences.findings import CheckReport as CheckReport
+from warpslam.sequences.findings import Finding as Finding
+from warpslam.sequences.images import ImageSequence
+from warpslam.sequences.pairing import frame_number
+from warpslam.sequences.pose_checks import KNOWN_DEPTH_SCALES, PoseFit, camera_text, check_poses
+from warpslam.sequences.structure_checks import check_registration, check_structure
 from warpslam.spread import spread
 
-OK, WARNING, ERROR = "ok", "warning", "error"
 MAX_DEPTH = 10.0
 """Depth beyond this does not count by default [m]."""
 QUICK_SAMPLES, THOROUGH_SAMPLES = 5, 16
-KNOWN_DEPTH_SCALES = (1.0, 256.0, 1000.0, 5000.0, 6553.5, 10000.0)
-"""Stored units per metre that are in use."""
 
 _DEPTH_RANGE = (0.25, 8.0)  # median [m] of a plausible room
 _MAX_MISSING = 0.6
 _MAX_STEP = 0.05  # [m] between two stored depth values
 _MIN_FIELD_OF_VIEW, _MAX_FIELD_OF_VIEW = 25.0, 120.0  # [degree]
 _MAX_OFF_CENTRE = 0.2  # of the image, principal point
-_MAX_JUMP = 0.5  # [m] of the true pose from frame to frame
 _MAX_PAUSE = 1.0  # [s]
-_PAIR_COUNT = 6  # of frames that poses and depth are compared in
-_SURE = 0.85  # agreement of depth and poses beyond which nothing else is tried
+_SMALL = 0.5  # [m]: what is smaller shows nothing to a grid of 16 cm
+_USUAL_EXTENT, _USUAL_DEPTH = 1.6, 3.2  # [m] of what the settings are made for
+_MIN_LEVELS = 50  # points, or values of depth, that say something
 _NAMED = 3  # frames or files named in a message
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What one check came to."""
-
-    check: str
-    """What was looked at."""
-    severity: str
-    """One of "error", "warning" and "ok"."""
-    message: str
-    """What is so, and where."""
-    remedy: str = ""
-    """What to do or type; empty where nothing is wrong."""
-
-    def __str__(self) -> str:
-        return f"{self.check}: {self.message}" + (f"; {self.remedy}" if self.remedy else "")
-
-
-@dataclass(frozen=True)
-class CheckReport:
-    """All findings about one folder."""
-
-    folder: str
-    """What was checked."""
-    name: str = ""
-    """Of the sequence; empty if it can't be opened."""
-    frames: int = 0
-    """How many it has."""
-    findings: tuple[Finding, ...] = field(default_factory=tuple)
-
-    @property
-    def errors(self) -> list[Finding]:
-        """Findings that can't work."""
-        return [finding for finding in self.findings if finding.severity == ERROR]
-
-    @property
-    def warnings(self) -> list[Finding]:
-        """Findings that will cost something."""
-        return [finding for finding in self.findings if finding.severity == WARNING]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        return {**asdict(self), "errors": len(self.errors), "warnings": len(self.warnings)}
 
 
 @dataclass(frozen=True)
@@ -95,8 +55,11 @@ def check_folder(
     path: str | Path,
     dataset: str = "auto",
     camera: str | None = None,
+    topics: str | None = None,
     *,
     sample_count: int | None = THOROUGH_SAMPLES,
+    max_depth: float = MAX_DEPTH,
+    read_poses: Callable[[RgbdSequence], tuple[np.ndarray, Path]] | None = None,
 ) -> CheckReport:
     """Open the sequence in a folder and check it.
 
@@ -104,15 +67,26 @@ def check_folder(
         path: Folder of one sequence.
         dataset: Format, as `warpslam.sequences.open_sequence` takes it.
         camera: Camera, as `open_sequence` takes it.
+        topics: Topics of a bag, as `open_sequence` takes them.
         sample_count: Frames to read, spread over the sequence; None for all.
+        max_depth: Depth beyond this does not count [m].
+        read_poses: Poses (N, 4, 4) that a run over the sequence would be given, and the file that they are from.
     """
     from warpslam.sequences import open_sequence
 
     try:
-        sequence = open_sequence(path, dataset, camera)
-    except DatasetError as error:
+        sequence = open_sequence(path, dataset, camera, topics)
+        poses, file = (None, None) if read_poses is None else read_poses(sequence)
+    except (DatasetError, MissingDependencyError) as error:
         return CheckReport(str(path), findings=(Finding("sequence", ERROR, str(error)),))
-    findings = check_sequence(sequence, sample_count=sample_count, thorough=True)
+    findings = check_sequence(
+        sequence,
+        sample_count=sample_count,
+        thorough=True,
+        max_depth=max_depth,
+        given_poses=poses,
+        given_path=file,
+    )
     return CheckReport(str(path), sequence.name, len(sequence), tuple(findings))
 
 
@@ -124,6 +98,8 @@ def check_sequence(
     max_depth: float = MAX_DEPTH,
     poses_matter: bool = True,
     thorough: bool = False,
+    given_poses: np.ndarray | None = None,
+    given_path: Path | None = None,
 ) -> list[Finding]:
     """Check a sequence that could be opened.
 
@@ -134,6 +110,8 @@ def check_sequence(
         max_depth: Depth beyond this does not count [m].
         poses_matter: Poses that do not fit the depth are an error, not only a warning.
         thorough: Also ask the file system for every file.
+        given_poses: Poses of these frames, (N, 4, 4), NaN where unknown, that take the place of the sequence's own.
+        given_path: The file that they are from.
     """
     frames = range(len(sequence)) if frames is None else frames
     count = len(frames) if sample_count is None else min(sample_count, len(frames))
@@ -141,10 +119,16 @@ def check_sequence(
     samples = [_sample(sequence, index) for index in chosen]
     findings = [*_check_frames(samples), *_check_files(sequence, frames, thorough), *_check_times(sequence, frames)]
     good = [sample.frame for sample in samples if sample.frame is not None]
+    fit = PoseFit.of(sequence, frames)
+    given = None if given_poses is None else PoseFit.of(sequence, frames, given_poses, given_path)
     findings += _check_camera(sequence)
     if good:
-        findings += [*_check_depth(sequence, good, max_depth), *_check_exposure(good)]
-    findings += _check_poses(sequence, frames, poses_matter)
+        findings += [*_check_depth(sequence, good, max_depth, given or fit), *_check_exposure(good)]
+        findings += [*check_registration(good), *check_structure(sequence, good)]
+    if given is None or fit.poses is not None:
+        findings += check_poses(sequence, frames, fit, poses_matter)
+    if given is not None:
+        findings += check_poses(sequence, frames, given, poses_matter=True)
     return findings
 
 
@@ -175,10 +159,10 @@ def _check_frames(samples: list[_Sample]) -> Iterator[Finding]:
 
 
 def _check_files(sequence: RgbdSequence, frames: Sequence[int], thorough: bool) -> Iterator[Finding]:
+    for remark in sequence.remarks:
+        yield Finding(remark.check, OK if remark.is_fine else WARNING, remark.message, remark.remedy)
     if not isinstance(sequence, FileSequence):
         return
-    for remark in sequence.remarks:
-        yield Finding("association", WARNING, remark, "complete the download, or go on with the frames that are left")
     numbers = [frame_number(sequence.files(index)[0]) for index in range(len(sequence))]
     known = [number for number in numbers if number is not None]
     steps = np.diff(known)
@@ -198,7 +182,7 @@ def _check_files(sequence: RgbdSequence, frames: Sequence[int], thorough: bool) 
             message = f"{len(bad)} image files are missing or empty: {named}"
             yield Finding("files", WARNING, message, "fetch these files again; their frames will be left out")
         else:
-            yield Finding("files", OK, f"all {2 * len(frames)} image files are there")
+            yield Finding("files", OK, "all image files are there")
 
 
 def _holds_something(path: Path) -> bool:
@@ -233,7 +217,7 @@ def _check_times(sequence: RgbdSequence, frames: Sequence[int]) -> Iterator[Find
 def _check_camera(sequence: RgbdSequence) -> Iterator[Finding]:
     camera = sequence.intrinsics
     text = f"fx {camera.fx:g} fy {camera.fy:g} cx {camera.cx:g} cy {camera.cy:g}, {camera.width} x {camera.height}"
-    remedy = f"give the camera of these images: --camera {_camera_text(sequence)} with the right numbers"
+    remedy = f"give the camera of these images: --camera {camera_text(sequence)} with the right numbers"
     across = np.degrees(2 * np.arctan(camera.width / (2 * camera.fx)))
     off = max(abs(camera.cx / camera.width - 0.5), abs(camera.cy / camera.height - 0.5))
     if off >= 0.45:
@@ -250,36 +234,12 @@ def _check_camera(sequence: RgbdSequence) -> Iterator[Finding]:
         yield Finding("camera", OK, f"{text}, {across:.0f} degrees across")
 
 
-def _camera_text(sequence: RgbdSequence, depth_scale: float | None = None) -> str:
-    """The stored camera as ``--camera`` takes it."""
-    if not isinstance(sequence, FileSequence):
-        return "FX,FY,CX,CY,WIDTH,HEIGHT,DEPTH_SCALE"
-    k = sequence.calibration.stored
-    numbers = (k.fx, k.fy, k.cx, k.cy, k.width, k.height, depth_scale or sequence.calibration.depth_scale)
-    return ",".join(f"{number:g}" for number in numbers)
-
-
-def _check_depth(sequence: RgbdSequence, frames: list[Frame], max_depth: float) -> Iterator[Finding]:
+def _check_depth(sequence: RgbdSequence, frames: list[Frame], max_depth: float, fit: PoseFit) -> Iterator[Finding]:
     depth = np.concatenate([frame.depth[::4, ::4].ravel() for frame in frames])
     missing = 1.0 - np.count_nonzero(depth > 0) / len(depth)
     values = depth[depth > 0]
-    median = float(np.median(values)) if len(values) else 0.0
-    beyond = float(np.mean(values > max_depth)) if len(values) else 1.0
-    scale = sequence.calibration.depth_scale if isinstance(sequence, FileSequence) else None
-    if beyond > 0.9 or not _DEPTH_RANGE[0] < median < _DEPTH_RANGE[1]:
-        remedy = "check the unit of depth"
-        fitting = [] if scale is None else [
-            known for known in KNOWN_DEPTH_SCALES if _DEPTH_RANGE[0] < median * scale / known < _DEPTH_RANGE[1]
-        ]  # fmt: skip
-        if fitting:
-            options = " or ".join(f"{known:g}" for known in fitting)
-            remedy = f"a depth_scale of {options} would suit a room: --camera {_camera_text(sequence, fitting[0])}"
-        unit = "" if scale is None else f" with {scale:g} stored units per metre"
-        severity = ERROR if beyond > 0.9 else WARNING
-        message = f"median depth is {median:.3g} m{unit}, {beyond:.0%} lies beyond {max_depth:g} m"
-        yield Finding("depth scale", severity, message, remedy)
-    else:
-        yield Finding("depth scale", OK, f"median depth {median:.2f} m, {beyond:.0%} beyond {max_depth:g} m")
+    scale = sequence.calibration.depth_scale if isinstance(sequence, ImageSequence) else None
+    yield _check_scale(sequence, frames, values, max_depth, fit)
     levels = np.unique(values[values <= max_depth])
     # Of values that are close to each other in depth; a hole between two walls says nothing.
     step = float(np.median(np.diff(levels))) if len(levels) > 1 else 0.0
@@ -287,13 +247,81 @@ def _check_depth(sequence: RgbdSequence, frames: list[Frame], max_depth: float) 
         message = f"depth comes in steps of {100 * step:.1f} cm ({len(levels)} different values)"
         yield Finding("depth steps", WARNING, message, "store depth with 16 bits, for example in millimetres")
     if scale is not None and len(values):
-        saturated = float(np.mean(np.isclose(values * scale, 65535.0, rtol=1e-6)))
+        stored = values * scale
+        saturated = float(np.mean(np.isclose(stored, 65535.0, rtol=1e-6)))
         if saturated > 0.01:
             message = f"{saturated:.0%} of depth has the largest stored value, 65535, which is no measurement"
             yield Finding("depth values", WARNING, message, "store 0 where depth is missing")
     severity = WARNING if missing > _MAX_MISSING else OK
     remedy = "keep nearer to surfaces, or avoid glass and sunlight" if missing > _MAX_MISSING else ""
     yield Finding("missing depth", severity, f"{missing:.0%} of the pixels have no depth", remedy)
+
+
+def _check_scale(
+    sequence: RgbdSequence, frames: list[Frame], values: np.ndarray, max_depth: float, fit: PoseFit
+) -> Finding:
+    """Whether depth is in the unit it is said to be in, and the scene of a size that the settings suit."""
+    median = float(np.median(values)) if len(values) else 0.0
+    beyond = float(np.mean(values > max_depth)) if len(values) else 1.0
+    scale = sequence.calibration.depth_scale if isinstance(sequence, ImageSequence) else None
+    size = max_depth / MAX_DEPTH  # that the settings are made for, beside a room
+    nearest, farthest = (size * limit for limit in _DEPTH_RANGE)
+    text = f"median depth is {median:.3g} m"
+    if scale is not None and len(values) and _is_rotated(values * scale):
+        message = "every stored depth is a multiple of 8: its bits are rotated, as SUN3D's are"
+        return Finding("depth scale", ERROR, message, f"type --camera {camera_text(sequence, 8 * scale)}")
+    extent = _extent(sequence, frames)
+    if beyond <= 0.5 and nearest < median < farthest and not 0 < extent < _SMALL * size:
+        return Finding("depth scale", OK, f"median depth {median:.2f} m, {beyond:.0%} beyond {max_depth:g} m")
+    wanted = _round(extent / _USUAL_EXTENT if 0 < extent < _SMALL * size else median / _USUAL_DEPTH)
+    as_large = f"--set scene_scale={wanted:g} makes grids and limits of that size"
+    if 0 < extent < _SMALL * size and median < farthest and (fit.confirms or median > _DEPTH_RANGE[0]):
+        message = f"what is measured is {100 * extent:.0f} cm across: small for grids of a room"
+        return Finding("depth scale", WARNING, message, as_large)
+    severity = ERROR if beyond > 0.9 else WARNING
+    message = f"{text}, {beyond:.0%} lies beyond {max_depth:g} m"
+    if fit.confirms:
+        return Finding("depth scale", severity, f"{message}; the poses confirm the unit", as_large)
+    fitting = [] if scale is None else [
+        known for known in KNOWN_DEPTH_SCALES if _DEPTH_RANGE[0] < median * scale / known < _DEPTH_RANGE[1]
+    ]  # fmt: skip
+    if scale is not None:
+        message = f"{text} with {scale:g} stored units per metre, {beyond:.0%} lies beyond {max_depth:g} m"
+    if not fitting:
+        return Finding(
+            "depth scale", severity, message, f"check the unit of depth; if the scene is as large, {as_large}"
+        )
+    options = " or ".join(f"{known:g}" for known in fitting)
+    remedy = f"a depth_scale of {options} would suit a room: --camera {camera_text(sequence, fitting[0])}; "
+    return Finding("depth scale", severity, message, remedy + f"if the scene is as large as that, {as_large}")
+
+
+def _is_rotated(stored: np.ndarray) -> bool:
+    """Whether 16-bit values (N,) have their low three bits at 0 all over: SUN3D rotates millimetres left by three."""
+    whole = np.rint(stored)
+    if np.abs(stored - whole).max() > 1e-2 or whole.max() > 65535 or len(np.unique(whole)) < _MIN_LEVELS:
+        return False
+    return bool((whole % 8 == 0).all())
+
+
+def _extent(sequence: RgbdSequence, frames: list[Frame]) -> float:
+    """Largest side of the box around what a frame measures [m], outliers left out; the median over frames."""
+    sizes = []
+    for frame in frames:
+        v, u = (4 * index for index in np.nonzero(frame.depth[::4, ::4]))
+        if len(u) >= _MIN_LEVELS:
+            points = sequence.intrinsics.backproject(u, v, frame.depth[v, u])
+            sizes.append(float(np.ptp(np.percentile(points, (2, 98), axis=0), axis=0).max()))
+    return float(np.median(sizes)) if sizes else 0.0
+
+
+def _round(factor: float) -> float:
+    """The nearest of 1, 1.5, 2, 3, 4, 5, 6, 8 times a power of ten."""
+    if factor <= 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(factor))
+    steps = np.array([1, 1.5, 2, 3, 4, 5, 6, 8, 10])
+    return float(f"{power * steps[np.argmin(np.abs(np.log(steps * power / factor)))]:.3g}")
 
 
 def _check_exposure(frames: list[Frame]) -> Iterator[Finding]:
@@ -304,64 +332,3 @@ def _check_exposure(frames: list[Frame]) -> Iterator[Finding]:
         yield Finding("colour", severity, message, "such frames are left out; light the scene, or fix the exposure")
     if not faults:
         yield Finding("colour", OK, "no image is black or over-exposed")
-
-
-def _check_poses(sequence: RgbdSequence, frames: Sequence[int], poses_matter: bool) -> Iterator[Finding]:
-    truth = sequence.ground_truth()
-    if truth is None:
-        yield Finding("poses", OK, "no ground truth: no trajectory error will be given")
-        return
-    truth = truth[np.asarray(frames)]
-    known = np.isfinite(truth).all(axis=(1, 2))
-    if not known.all():
-        message = f"{np.count_nonzero(~known)} of {len(known)} frames have no pose"
-        yield Finding("poses", WARNING if poses_matter else OK, message)
-    jumps = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1)
-    stride = getattr(frames, "step", 1)
-    large = np.flatnonzero(jumps > _MAX_JUMP * stride)
-    if len(large):
-        where = ", ".join(f"frame {frames[int(i) + 1]} ({jumps[i]:.2f} m)" for i in large[:_NAMED])
-        message = f"{len(large)} poses jump from one frame to the next: {where}"
-        yield Finding("poses", WARNING, message, "check that poses belong to these frames and are in metres")
-    yield _check_convention(sequence, frames, truth, poses_matter)
-
-
-def _check_convention(sequence: RgbdSequence, frames: Sequence[int], truth: np.ndarray, poses_matter: bool) -> Finding:
-    pairs: list[tuple[DepthView, DepthView]] = []
-    for i, j in moving_pairs(truth, 2 * _PAIR_COUNT):
-        if len(pairs) == _PAIR_COUNT:
-            break
-        try:
-            depths = [sequence[frames[k]].depth for k in (i, j)]
-        except DatasetError:
-            continue  # reported with the frames
-        pairs.append((DepthView(depths[0], truth[i]), DepthView(depths[1], truth[j])))
-    if not pairs:
-        return Finding("pose convention", OK, "the camera moves too little, or its frames can't be read, to tell")
-    camera = sequence.intrinsics
-    scores = {name: agreement(pairs, camera, name) for name in CONVENTIONS}
-    best, given = max(scores, key=lambda name: scores[name]), scores[EXPECTED]
-    bad = ERROR if poses_matter else WARNING
-    if scores[best] > 0.5 and scores[best] > given + 0.15:
-        steps = []
-        if best.startswith("world"):
-            steps.append("T = numpy.linalg.inv(T)")
-        if best.endswith("OpenGL axes"):
-            steps.append("T[:, 1:3] *= -1")
-        message = f"poses are read as {EXPECTED}, which {given:.0%} of the depth agrees with; as {best} it is "
-        message += f"{scores[best]:.0%}"
-        return Finding("pose convention", bad, message, "convert each 4x4 matrix T: " + "; ".join(steps))
-    if given < _SURE and isinstance(sequence, FileSequence):
-        # Every scale fits a little where the camera only turns, so another one has to fit clearly better.
-        scale = sequence.calibration.depth_scale
-        others = [known for known in KNOWN_DEPTH_SCALES if known != scale]
-        fits = {known: agreement(pairs, camera, depth_factor=scale / known) for known in others}
-        better = max(others, key=lambda known: fits[known])
-        if fits[better] > 0.5 and fits[better] > given + 0.15:
-            message = f"with depth_scale {scale:g} {given:.0%} of the depth agrees with the poses, with {better:g} "
-            message += f"{fits[better]:.0%}"
-            return Finding("depth scale", bad, message, f"type --camera {_camera_text(sequence, better)}")
-    if given > 0.5:
-        return Finding("pose convention", OK, f"{given:.0%} of the depth agrees with the poses, as {EXPECTED}")
-    message = f"only {given:.0%} of the depth agrees with the poses, and no other convention fits"
-    return Finding("pose convention", WARNING, message, "check that poses, camera and frames are of one recording")

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from warpslam.sequences.calibration import find_calibration
 from warpslam.sequences.files import FileSequence
 from warpslam.sequences.image_files import list_images, read_exr
+from warpslam.sequences.pairing import pair
+from warpslam.sequences.recorder_files import find_recorded
 
 # The renderer writes about 1e10 where a ray leaves the scene.
 _MAX_DEPTH = 1e3
@@ -20,11 +21,14 @@ class CoFusionSequence(FileSequence):
     preset = "cofusion"
 
     def __init__(self, folder: Path, camera: str | None = None) -> None:
+        depth_files = list_images(folder / "depth_noise", suffixes=(".exr",))
+        pairs = pair(folder, list_images(folder / "colour"), depth_files)
         super().__init__(
             folder,
-            find_calibration(folder, camera, "cofusion"),
-            list_images(folder / "colour"),
-            list_images(folder / "depth_noise", suffixes=(".exr",)),
+            find_recorded(folder, camera, "cofusion", pairs.rgb_files, pairs.depth_files),
+            pairs.rgb_files,
+            pairs.depth_files,
+            remarks=pairs.remarks,
         )
 
     def read_depth_metres(self, path: Path) -> np.ndarray:

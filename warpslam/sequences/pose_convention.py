@@ -7,25 +7,45 @@ frame i measured lie on what frame j measured.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from warpslam.camera import Intrinsics
-from warpslam.poses import rotation_angles
+from warpslam.errors import DatasetError
+from warpslam.poses import pose_from_vector, rotation_angles, vector_from_pose
+from warpslam.sequences.base import RgbdSequence
+from warpslam.sequences.registration import axis_depth
 from warpslam.spread import spread
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
+OPENCV, OPENGL = "camera-to-world, OpenCV axes", "camera-to-world, OpenGL axes"
 CONVENTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "camera-to-world, OpenCV axes": lambda T: T,
-    "camera-to-world, OpenGL axes": lambda T: T @ OPENGL_FROM_OPENCV,
+    OPENCV: lambda T: T,
+    OPENGL: lambda T: T @ OPENGL_FROM_OPENCV,
     "world-to-camera, OpenCV axes": lambda T: np.linalg.inv(T),
     "world-to-camera, OpenGL axes": lambda T: np.linalg.inv(OPENGL_FROM_OPENCV @ T),
 }
 """How a stored matrix may be meant: T_world_camera in OpenCV axes from the stored one."""
 EXPECTED = next(iter(CONVENTIONS))
+W_FIRST = "camera-to-world with the quaternion's w first"
+_MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+
+
+def _w_first(T: np.ndarray) -> np.ndarray:
+    """The pose whose quaternion was stored as qw qx qy qz and read as qx qy qz qw."""
+    qw, qx, qy, qz, *t = vector_from_pose(T)
+    return pose_from_vector(np.array([qx, qy, qz, qw, *t]))
+
+
+READINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    **CONVENTIONS,
+    W_FIRST: _w_first,
+    "camera-to-world of a mirrored world (y up, as ICL-NUIM's)": lambda T: _MIRROR @ T @ _MIRROR,
+}
+"""`CONVENTIONS`, and what else may have become of a pose on its way into a file."""
 
 TOLERANCE = 0.04
 """Two depths agree if they differ by less than this share."""
@@ -43,6 +63,9 @@ class DepthView:
     """z-depth [m], (H, W), 0 = missing."""
     pose: np.ndarray
     """Matrix as stored, (4, 4)."""
+
+
+Pairs = list[tuple[DepthView, DepthView]]
 
 
 def moving_pairs(poses: np.ndarray, count: int) -> list[tuple[int, int]]:
@@ -69,6 +92,35 @@ def moving_pairs(poses: np.ndarray, count: int) -> list[tuple[int, int]]:
     return pairs
 
 
+def posed_pairs(
+    sequence: RgbdSequence, poses: np.ndarray, frames: Sequence[int] | None = None, count: int = 6
+) -> Pairs:
+    """Pairs of frames of a moving camera with their depth, up to ``count``; frames that can't be read are passed over.
+
+    Args:
+        sequence: The sequence.
+        poses: Matrices as stored, (N, 4, 4), NaN where unknown.
+        frames: Numbers of the N frames in the sequence; 0, 1, 2, ... if None.
+        count: Pairs wanted.
+    """
+    frames = range(len(poses)) if frames is None else frames
+    pairs: Pairs = []
+    for i, j in moving_pairs(poses, 2 * count):
+        if len(pairs) == count:
+            break
+        try:
+            a, b = (DepthView(sequence[frames[k]].depth, poses[k]) for k in (i, j))
+        except DatasetError:
+            continue
+        pairs.append((a, b))
+    return pairs
+
+
+def on_axis(view: DepthView, camera: Intrinsics) -> DepthView:
+    """The view, if its depth was measured along the rays."""
+    return DepthView(axis_depth(view.depth, camera), view.pose)
+
+
 def agreement(
     pairs: list[tuple[DepthView, DepthView]], camera: Intrinsics, convention: str = EXPECTED, depth_factor: float = 1.0
 ) -> float:
@@ -77,10 +129,10 @@ def agreement(
     Args:
         pairs: Frames and their stored matrices.
         camera: Camera of the depth images.
-        convention: One of `CONVENTIONS`.
+        convention: One of `READINGS`.
         depth_factor: Depth is multiplied by this first.
     """
-    read = CONVENTIONS[convention]
+    read = READINGS[convention]
     agreeing = compared = 0.0
     for a, b in pairs:
         T_b_a = np.linalg.inv(read(b.pose)) @ read(a.pose)

@@ -17,7 +17,7 @@ _ORTHONORMAL_TOLERANCE = 0.05
 def read_matrix_lines(path: Path) -> np.ndarray:
     """One row-major camera-to-world 4x4 matrix a line; shape (N, 4, 4), float64, NaN where a line is not finite."""
     rows = read_numbers(path, 16, "a row-major 4x4 matrix")
-    return _stack([_as_pose(path, number, values.reshape(4, 4)) for number, values in rows])
+    return _stack([as_pose(path, number, values.reshape(4, 4)) for number, values in rows])
 
 
 def read_matrix_file(path: Path) -> np.ndarray:
@@ -25,7 +25,7 @@ def read_matrix_file(path: Path) -> np.ndarray:
     rows = read_numbers(path, 4, "one row of a 4x4 matrix")
     if len(rows) != 4:
         raise DatasetError(f"{path}: {len(rows)} lines of numbers, expected the 4 rows of a matrix; correct it")
-    return _as_pose(path, rows[0][0], np.stack([values for _, values in rows]))
+    return as_pose(path, rows[0][0], np.stack([values for _, values in rows]))
 
 
 def read_redwood_log(path: Path, frame_count: int) -> np.ndarray:
@@ -50,7 +50,7 @@ def read_redwood_log(path: Path, frame_count: int) -> np.ndarray:
                 f"{path}:{number}: frame {words[0]} has {len(block)} of 4 matrix lines; complete the file"
             )
         rows = [parse_numbers(path, at, row, 4, "one row of a 4x4 matrix") for at, row in block]
-        poses[int(header[0])] = _as_pose(path, number + 1, np.stack(rows))
+        poses[int(header[0])] = as_pose(path, number + 1, np.stack(rows))
     return poses
 
 
@@ -63,7 +63,12 @@ def read_tum_poses(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return times[order], poses[order]
 
 
-def _as_pose(path: Path, number: int, T: np.ndarray) -> np.ndarray:
+def as_pose(path: Path, number: int, T: np.ndarray) -> np.ndarray:
+    """A matrix (4, 4) that is rigid, or NaN where it is not finite.
+
+    Raises:
+        DatasetError: It is finite and not rigid; the line is named.
+    """
     if not np.isfinite(T).all():
         return np.full((4, 4), np.nan)
     R = T[:3, :3]

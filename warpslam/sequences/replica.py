@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from warpslam.sequences.calibration import find_calibration
-from warpslam.sequences.files import FileSequence, check_partners
-from warpslam.sequences.image_files import list_images
+from warpslam.sequences.files import FileSequence
+from warpslam.sequences.image_files import DEPTH_SUFFIXES, list_images
+from warpslam.sequences.pairing import pair
 from warpslam.sequences.pose_files import read_matrix_lines
+from warpslam.sequences.recorder_files import find_recorded
 
 
 class ReplicaSequence(FileSequence):
@@ -19,15 +20,14 @@ class ReplicaSequence(FileSequence):
     preset = "replica"
 
     def __init__(self, folder: Path, camera: str | None = None) -> None:
-        rgb_files = list_images(folder / "results", "frame*")
-        depth_files = list_images(folder / "results", "depth*", (".png",))
-        if len(rgb_files) == len(depth_files):
-            check_partners(rgb_files, depth_files)
-        trajectory = folder / "traj.txt"
+        results, trajectory = folder / "results", folder / "traj.txt"
+        pairs = pair(folder, list_images(results, "frame*"), list_images(results, "depth*", DEPTH_SUFFIXES))
+        poses = read_matrix_lines(trajectory) if trajectory.is_file() else None
         super().__init__(
             folder,
-            find_calibration(folder, camera, "replica"),
-            rgb_files,
-            depth_files,
-            poses=read_matrix_lines(trajectory) if trajectory.is_file() else None,
+            find_recorded(folder, camera, "replica", pairs.rgb_files, pairs.depth_files),
+            pairs.rgb_files,
+            pairs.depth_files,
+            poses=pairs.poses(poses, trajectory),
+            remarks=pairs.remarks,
         )

@@ -115,9 +115,7 @@ def test_keyframes_that_show_something_else_have_no_rows_in_common():
     pool = ImagePool(CAMERA, wp.get_device("cpu"))
     rgb, depth = take(np.eye(4))
     noise = np.random.default_rng(0).integers(0, 256, rgb.shape, dtype=np.uint8)
-    keyframes = [
-        Keyframe(n, pool.add(image, depth), np.eye(4), FrameMotion()) for n, image in enumerate((rgb, noise))
-    ]
+    keyframes = [Keyframe(n, pool.add(image, depth), np.eye(4), FrameMotion()) for n, image in enumerate((rgb, noise))]
     second = SecondWitness(CAMERA, wp.get_device("cpu"), 8.0, keyframes, pool)
     assert second.between(0, 1, np.eye(4)) is None
 

@@ -15,8 +15,8 @@ import warp as wp
 from warpslam.camera import NO_MOTION, FrameMotion, Intrinsics
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
-from warpslam.tracking.features.device import FoundPose
 from warpslam.tracking.features.detection import FeatureFrame, SensorTiming, detect, retimed
+from warpslam.tracking.features.device import FoundPose
 from warpslam.tracking.features.settings import FeatureSettings
 from warpslam.tracking.features.witness import FeatureRows, FeatureWitness, Witness
 

@@ -75,10 +75,11 @@ def refine_window(
     asked["keyframe"], asked["row"] = zip(*((members[i].points, members[j].row) for i, j in pairs), strict=True)
     count = len(members)
     added: dict[tuple[int, int], PairRows] = {}
-    for i, j in pairs if more is not None else ():
-        rows = more(i, j, inverse(poses[j]) @ poses[i]) if i < j else None
-        if rows is not None:
-            added[i, j] = rows
+    if more is not None:
+        for i, j in ((i, j) for i, j in pairs if i < j):
+            rows = more(i, j, inverse(poses[j]) @ poses[i])
+            if rows is not None:
+                added[i, j] = rows
     for _ in range(iterations):
         transforms = [inverse(poses[j]) @ poses[i] for i, j in pairs]
         asked["T"] = transforms
