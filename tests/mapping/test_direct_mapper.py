@@ -18,6 +18,7 @@ SETTINGS = [
     "tracking.use_given_poses=true", "mapping.pixels=160", "mapping.first_iterations=12", "keyframes.every=2",
     "mapping.refinement_rounds=2", "grid.fine_spacing=0.16",
 ]  # fmt: skip
+LAYOUTS = ["grid.layout=dense", "grid.layout=blocks"]
 
 
 @pytest.fixture(scope="module")
@@ -74,14 +75,16 @@ def test_the_logit_becomes_the_signed_distance(frames):
     assert np.mean(logit(-0.4) < -0.5) > 0.9
 
 
-def test_two_runs_are_the_same(frames):
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_two_runs_are_the_same(frames, layout):
     """Threads and places of rows leave no trace."""
-    assert_same(*(step(new(), frames[:4]) for _ in range(2)))
+    assert_same(*(step(new(layout), frames[:4]) for _ in range(2)))
 
 
-def test_a_saved_map_goes_on_as_if_it_had_not_been(frames, tmp_path):
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_saved_map_goes_on_as_if_it_had_not_been(frames, tmp_path, layout):
     """Moments, step counts and the colour decoder's are in the file: what follows, refinement too, is the same."""
-    whole = step(new(), frames[:3])
+    whole = step(new(layout), frames[:3])
     whole.save(tmp_path / "map.safetensors")
     resumed = Slam.load(tmp_path / "map.safetensors", "cpu")
     assert_same(resumed, whole)
@@ -90,9 +93,10 @@ def test_a_saved_map_goes_on_as_if_it_had_not_been(frames, tmp_path):
     assert_same(resumed, whole)
 
 
-def test_beside_tracking_the_tracker_gets_the_rows_that_changed(frames):
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_beside_tracking_the_tracker_gets_the_rows_that_changed(frames, layout):
     """With the overlapped schedule both maps are the same when all is taken over."""
-    slam = step(new("schedule=overlapped"), frames[:4])
+    slam = step(new("schedule=overlapped", layout), frames[:4])
     slam.wait()
     assert slam.mapper.scene is not slam.scene
     for level, grid in slam.mapper.scene.grids.items():

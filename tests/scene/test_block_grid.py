@@ -25,7 +25,7 @@ CAMERA = Intrinsics(60.0, 60.0, 39.5, 29.5, 80, 60)
 DEVICES = ["cpu", *(str(d) for d in wp.get_cuda_devices())]
 LIVE = [
     "tracking.use_given_poses=true", "mapping.pixels=160", "mapping.first_iterations=12", "keyframes.every=2",
-    "mapping.refinement_rounds=2", "grid.fine_spacing=0.12",
+    "mapping.refinement_rounds=2", "grid.fine_spacing=0.12", "grid.layout=blocks",
 ]  # fmt: skip
 RENDERED = [
     "tracking.use_given_poses=true", "mapping.pixels=120", "mapping.first_iterations=10", "mapping.iterations=6",

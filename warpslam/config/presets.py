@@ -31,7 +31,7 @@ _TUM_GRID = {"middle_spacing": 0.16, "fine_spacing": 0.08, "color_spacing": 0.08
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "live": {
-        "grid": {"fine_spacing": 0.08, "layout": "blocks"},
+        "grid": {"fine_spacing": 0.08},
         "mapping": {"loss": "direct", "every": 1, "pixels": 800, "iterations": 3, "first_iterations": 60},
         "meshing": {"level_set": 0.0},
     },
