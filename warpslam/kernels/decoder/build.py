@@ -40,8 +40,13 @@ def decoder_kernels(target: str, layout: str = "dense") -> SimpleNamespace:
     )
 
 
+CPU = decoder_kernels("cpu")
+CUDA = decoder_kernels("cuda")
 _KERNELS = {
-    (target, layout): decoder_kernels(target, layout) for target in ("cpu", "cuda") for layout in ("dense", "blocks")
+    ("cpu", "dense"): CPU,
+    ("cuda", "dense"): CUDA,
+    ("cpu", "blocks"): decoder_kernels("cpu", "blocks"),
+    ("cuda", "blocks"): decoder_kernels("cuda", "blocks"),
 }
 
 
