@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from functools import partial
 from pathlib import Path
 
@@ -55,3 +56,11 @@ def small_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
 def golden() -> np.lib.npyio.NpzFile:
     """Reference vectors: inputs and outputs of the authors' implementation on a small scene."""
     return np.load(_shared_path("WARPSLAM_GOLDEN", "golden/reference_vectors.npz"))
+
+
+@pytest.fixture
+def ctrl_c():
+    """SIGINT is ctrl-C, as in a terminal; a shell makes what it runs in the background ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from warpslam.camera import Intrinsics, SensorTiming
+from warpslam.camera import Intrinsics, SensorTiming, is_number
 from warpslam.errors import ConfigError
 
 CAMERA = Intrinsics(500.0, 480.0, 310.0, 245.0, 640, 480)
@@ -42,6 +42,18 @@ def test_a_camera_that_can_not_be_is_refused(name, value):
     """The field and its value are named."""
     with pytest.raises(ConfigError, match=rf"camera\.{name} = {value}"):
         Intrinsics(**{**vars(CAMERA), name: value})
+
+
+@pytest.mark.parametrize("value", [10**30, -(10**30), 10**400, "x", None, True, 1j, np.zeros(3), [1.0]])
+def test_what_is_no_number_is_refused(value):
+    """By the fields of a camera and of its timing alike, with an error of ours; whole numbers may be of any length."""
+    assert not is_number(value) or abs(value) == 10**30
+    for name in ("fx", "cy", "width"):
+        with pytest.raises(ConfigError, match=rf"camera\.{name}"):
+            Intrinsics(**{**vars(CAMERA), name: value})
+    for name in ("depth_delay", "readout"):
+        with pytest.raises(ConfigError, match=rf"camera\.{name}"):
+            SensorTiming(**{name: value})
 
 
 def test_sensor_timing_adds_its_delay_to_the_stamps():

@@ -1,5 +1,6 @@
 """Files of strangers: what is no regular file is not opened, what is too large not read, what unfolds not unfolded."""
 
+import io
 import os
 import socket
 import threading
@@ -28,6 +29,29 @@ def _device(path):
 
 def _loop(path):
     path.symlink_to(path)
+
+
+def test_a_file_of_the_system_that_waits_is_not_waited_for(tmp_path, monkeypatch):
+    """/proc/kmsg says that it is a regular file; whoever reads it waits for the kernel's next message, and without
+    waiting gets None.
+    """
+
+    class Waiting(io.BytesIO):
+        def read(self, size=-1):
+            return None
+
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(os, "fdopen", lambda descriptor, mode: Waiting())
+    with pytest.raises(OSError, match="nothing to be read"):
+        read_bytes(tmp_path / "file", 100)
+
+
+def test_empty_files_are_for_those_who_can_read_them(tmp_path):
+    """Text may be empty; what is opened by others must hold something."""
+    (tmp_path / "file").touch()
+    assert read_text(tmp_path / "file") == ""
+    with pytest.raises(OSError, match="is empty"):
+        check_regular(tmp_path / "file")
 
 
 @pytest.mark.parametrize("make", [_fifo, _socket, _device, _loop, lambda path: path.mkdir()])

@@ -196,7 +196,7 @@ def test_only_vertices_in_the_frustum_change(frames):
     slam = run(frames[:1], "mapping.coarse=false")
     grid = slam.scene.grids["middle"]
     before = grid.features.numpy().copy()
-    slam.mapper.map_frame(slam.images, 1, slam.history.pose(0), slam.keyframes)
+    slam.mapper.start_frame(slam.images, 1, slam.history.pose(0), slam.keyframes)()
     index = np.stack(np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij"), -1).reshape(-1, 3)
     camera = (grid.spacing * (grid.first + index) - frames[0].T_world_camera[:3, 3]) @ frames[0].T_world_camera[:3, :3]
     behind = (camera[:, 2] < 0) & (np.linalg.norm(camera, axis=1) > 0.5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from numbers import Real
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,18 @@ MAX_IMAGE_SIZE = 16384
 """Largest width and height of an image [px]: what OpenCV warps without trouble."""
 MIN_FOCAL, MAX_PIXELS = 1e-2, 1e7
 """Least focal length, and largest one and coordinate of a principal point [px]."""
+_ABSURD = 1e300
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a finite number, and none that is absurd.
+
+    (`numpy.isfinite` raises for what is no number, and for whole ones of more than 64 bits.)
+    """
+    if not isinstance(value, Real) or isinstance(value, bool):
+        return False
+    number: Any = value
+    return bool(abs(number) < _ABSURD)
 
 
 @dataclass(frozen=True)
@@ -35,11 +48,11 @@ class Intrinsics:
     def __post_init__(self) -> None:
         for name in ("fx", "fy", "cx", "cy", "width", "height"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, Real):
-                raise ConfigError(f"camera.{name} = {value!r} must be a number")
+            if not is_number(value):
+                raise ConfigError(f"camera.{name} = {value!r} must be a finite number")
         for name in ("fx", "fy", "width", "height"):
             value = getattr(self, name)
-            if not np.isfinite(value) or value <= 0:
+            if value <= 0:
                 raise ConfigError(f"camera.{name} = {value!r} must be a positive number")
         for name in ("width", "height"):
             value = getattr(self, name)
@@ -54,7 +67,7 @@ class Intrinsics:
                     f"camera.{name} = {getattr(self, name)!r} must be {MIN_FOCAL:g} to {MAX_PIXELS:g} pixels"
                 )
         for name in ("cx", "cy"):
-            if not abs(getattr(self, name)) <= MAX_PIXELS:  # NaN is not
+            if abs(getattr(self, name)) > MAX_PIXELS:
                 raise ConfigError(
                     f"camera.{name} = {getattr(self, name)!r} must be finite, at most {MAX_PIXELS:g} pixels"
                 )
@@ -130,12 +143,11 @@ class SensorTiming:
     """Time from the first to the last row, of colour and depth alike [s]; 0 = global shutter."""
 
     def __post_init__(self) -> None:
-        # "not <=" catches NaN.
-        if not abs(self.depth_delay) <= MAX_DEPTH_DELAY:
+        if not is_number(self.depth_delay) or abs(self.depth_delay) > MAX_DEPTH_DELAY:
             raise ConfigError(
                 f"camera.depth_delay = {self.depth_delay!r} must be -{MAX_DEPTH_DELAY} to {MAX_DEPTH_DELAY} seconds"
             )
-        if not 0 <= self.readout <= MAX_READOUT:
+        if not is_number(self.readout) or not 0 <= self.readout <= MAX_READOUT:
             raise ConfigError(f"camera.readout = {self.readout!r} must be 0 to {MAX_READOUT} seconds")
 
     def depth_offset(self, timestamp: float, depth_timestamp: float | None) -> float:

@@ -54,17 +54,19 @@ class FrameResult:
     """Mean loss per ray: "tracking" (with direct tracking the robust cost per point), and of the stages of mapping that
     was done by then.
     """
-    inliers: float = 1.0
-    """Share of the depth rays into what the map has seen that agree with it, in [0, 1]."""
-    depth_error: float = 0.0
-    """Mean ``|measured - rendered depth|`` of the inliers [m]."""
+    inliers: float = math.nan
+    """Share of the depth rays into what the map has seen that agree with it, in [0, 1]; NaN where nothing was compared,
+    as in the first frame.
+    """
+    depth_error: float = math.nan
+    """Mean ``|measured - rendered depth|`` of the inliers [m]; NaN where nothing was compared."""
     correlation: float | None = None
     """Of grey values with the keyframe that the frame was registered to, in [-1, 1]; None with other tracking."""
     covariance: np.ndarray | None = None
     """Of the pose, float64 (6, 6): T_world_camera is uncertain by exp(xi) on its right, xi = (v, w) [m, rad],
     against the keyframe."""
     timings: dict[str, float] = field(default_factory=dict)
-    """Seconds by phase: "tracking", "mapping" (overlapped: waiting for it and taking it over), "keyframe"."""
+    """Seconds by phase: "tracking", "loops", "mapping" (overlapped: waiting for it and taking it over), "keyframe"."""
     message: str = ""
     """Why the frame is not OK."""
     reference: int | None = None
@@ -176,7 +178,7 @@ def admit(
 def skipped(frame: AdmittedFrame, last_pose: np.ndarray) -> FrameResult:
     """What is said of a frame with a fault."""
     status = FrameStatus.SKIPPED
-    return FrameResult(frame.index, frame.timestamp, last_pose.copy(), status, inliers=0.0, message=frame.fault)
+    return FrameResult(frame.index, frame.timestamp, last_pose.copy(), status, message=frame.fault)
 
 
 def read_images(

@@ -18,11 +18,27 @@ _KINDS = {
 }  # fmt: skip
 
 
-def check_regular(path: str | Path, limit: float = float("inf")) -> int:
-    """Size of a file [bytes], which is a regular one: others may never end, or never begin.
+def check_name(path: Path) -> None:
+    """Refuse what can't be the path of a file, which the system's functions tell by a `ValueError`.
 
     Raises:
-        OSError: There is none, it is something else, or it is larger than ``limit``.
+        OSError: It is empty, ends in no name, holds a zero, or can't be written in the system's letters.
+    """
+    try:
+        if path.name and b"\0" not in os.fsencode(path):
+            return
+    except UnicodeEncodeError:
+        pass
+    raise OSError(errno.EINVAL, "is no name of a file", str(path))
+
+
+def check_regular(path: str | Path, limit: float = float("inf"), *, may_be_empty: bool = False) -> int:
+    """Size of a file [bytes], which is a regular one: others may never end, or never begin.
+
+    So do some that Linux shows as regular, in /proc; these are empty.
+
+    Raises:
+        OSError: There is none, it is something else, larger than ``limit``, or empty and must not be.
     """
     try:
         found = os.stat(path)
@@ -34,6 +50,8 @@ def check_regular(path: str | Path, limit: float = float("inf")) -> int:
     if found.st_size > limit:
         text = f"has {found.st_size / MEGABYTE:.1f} MB, expected at most {limit / MEGABYTE:g}"
         raise OSError(errno.EFBIG, text, str(path))
+    if found.st_size == 0 and not may_be_empty:
+        raise OSError(errno.EINVAL, "is empty", str(path))
     return found.st_size
 
 
@@ -43,7 +61,7 @@ def read_bytes(path: str | Path, limit: float) -> bytes:
     Raises:
         OSError: As `check_regular`, or it can't be read.
     """
-    check_regular(path, limit)
+    check_regular(path, limit, may_be_empty=True)
     # Something else may have come into its place; opened so, a pipe does not wait for its other end.
     descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     with os.fdopen(descriptor, "rb") as file:
@@ -53,6 +71,8 @@ def read_bytes(path: str | Path, limit: float) -> bytes:
             data = file.read(int(min(limit, 1 << 62)) + 1)
         except MemoryError:
             raise OSError(errno.ENOMEM, "does not fit into memory", str(path)) from None
+    if data is None:  # a file of the system's that waits for what is to come
+        raise OSError(errno.EAGAIN, "has nothing to be read", str(path))
     if len(data) > limit:
         raise OSError(errno.EFBIG, f"has more than {limit / MEGABYTE:g} MB", str(path))
     return data

@@ -21,12 +21,13 @@ from warpslam.field.decoder_files import load_decoders
 from warpslam.field.decoders import Decoders
 from warpslam.field.rendering import RenderedImage, render_image
 from warpslam.frames import AdmittedFrame, FrameResult, FrameStatus, admit, check_settings, skipped
+from warpslam.loops.closer import LoopCloser
 from warpslam.mapping.frustum import measured_extent
 from warpslam.mapping.policy import new_mapper
 from warpslam.mapping.scheduler import MappingTask, new_scheduler
 from warpslam.meshing import extract_mesh
 from warpslam.poses import MAX_DISTANCE, check_transform, is_near
-from warpslam.runtime.compilation import blocks_module, compile_kernels
+from warpslam.runtime.compilation import compile_kernels
 from warpslam.runtime.environment import named_device
 from warpslam.runtime.exclusive import exclusive
 from warpslam.runtime.launching import synchronize
@@ -45,6 +46,9 @@ from warpslam.trajectory import TWIST_STEPS, FrameHistory, Located, Trajectory
 
 if TYPE_CHECKING:
     import trimesh
+
+PART_GAP = 1.0
+"""Between a map and a part that is mapped beside it [m]."""
 
 
 class Slam:
@@ -93,9 +97,7 @@ class Slam:
         self.device = named_device(device)
         self.seed = seed
         start = time.perf_counter()
-        in_blocks = self.config.grid.layout == "blocks"
-        extra = [blocks_module("cuda" if self.device.is_cuda else "cpu")] if in_blocks else []
-        compile_kernels(self.device, extra=extra)
+        compile_kernels(self.device, layout=self.config.grid.layout or "dense")
         self.compile_seconds = time.perf_counter() - start
         self.scene = SceneMap(decoders or load_decoders(self.config.decoders), self.config.grid, self.device, seed)
         self.history = FrameHistory()
@@ -105,6 +107,7 @@ class Slam:
         self.localizer = Localizer(self.tracker, self.config.tracking, intrinsics)
         self.mapper = new_mapper(self.scene, intrinsics, self.config, self.device, seed)
         self.direct = self._direct_tracker()
+        self.loops = self._loop_closer()
         self.timing_estimator = self._timing_estimator()
         self.scheduler = new_scheduler(self.config.schedule, self.mapper, self.images)
         self._seen: list[SeenDepth] = []
@@ -165,6 +168,7 @@ class Slam:
         self.history.add(frame.timestamp, located)
         self._digest = digest
         found = self._estimate_timing(frame, account)
+        self._close_loops(frame, account)
         self._note_motion(frame)  # what is mapped and kept are images of one moment
         if located.status is FrameStatus.OK and self.config.mapping.enabled:
             is_keyframe = self._is_keyframe(frame)  # Sec. 3.4
@@ -234,6 +238,12 @@ class Slam:
         return DirectTracker(
             self.intrinsics, self.config.direct, max_depth, self.device, self.keyframes, self.images, readout
         )
+
+    def _loop_closer(self) -> LoopCloser | None:
+        """What closes loops; with direct tracking alone, whose keyframes lie to each other as they were registered."""
+        if self.direct is None or not self.config.loops.enabled:
+            return None
+        return LoopCloser(self.direct, self.images, self.config.loops)
 
     def _timing_estimator(self, first: int = 0) -> TimingEstimator | None:
         """What estimates the camera's timing from frame ``first`` on, where nothing is known of it."""
@@ -326,15 +336,40 @@ class Slam:
             return Located(pose)
         with account.timed("tracking"):
             located = self._track(frame)
+            if self._begins_elsewhere(frame, located):
+                located = self._begin_part(frame)
         if located.loss is not None:
             account.losses["tracking"] = located.loss
         return located
 
     def _track(self, frame: AdmittedFrame) -> Located:
         if self.direct is not None:
+            estimator = self.timing_estimator
+            self.direct.is_timing_open = estimator is not None and estimator.is_open
             return self.direct.locate(frame, self.history, None if self.scene.is_empty else self.scene.arrays())
         self.images.rectify_current(self._motion(frame))
         return self.localizer.locate(self.scene.arrays(), self.images, frame.index, self.history, self.keyframes)
+
+    def _begins_elsewhere(self, frame: AdmittedFrame, located: Located) -> bool:
+        """Whether a camera that was switched on in a map has recognised nothing for long enough to be mapped apart."""
+        after = self.config.loops.own_part_after
+        if self.loops is None or self.direct is None or self.direct.fixed or not after or not located.why_lost:
+            return False
+        return not self.direct.is_confirming and self.history.lost_since_break + 1 >= after
+
+    def _begin_part(self, frame: AdmittedFrame) -> Located:
+        """A part of the map on its own, beside what there is, which a loop may join later."""
+        assert self.direct is not None
+        pose, reach = np.eye(4), self.config.grid.max_depth
+        pose[0, 3] = max((keyframe.pose[0, 3] for keyframe in self.keyframes), default=0.0) + 2.0 * reach + PART_GAP
+        if not self.scene.is_empty:
+            pose[0, 3] = self.scene.high[0] + reach + PART_GAP
+            try:
+                self.scene.check_growth(*measured_extent(frame.depth, pose, self.intrinsics))
+            except MapSizeError as error:
+                return Located(self.history.last_pose, f"nothing is recognised, and beside what is mapped {error}")
+        self.direct.place(frame, pose, is_apart=True)
+        return Located(pose, after_loss=True)
 
     @property
     def _has_begun(self) -> bool:
@@ -362,6 +397,26 @@ class Slam:
                 known = {index: twist for index, twist in twists.items() if twist is not None}
                 direct.retime(change, known, estimator.first)
         return found.to_dict()
+
+    def _close_loops(self, frame: AdmittedFrame, account: _Account) -> None:
+        """Compare new keyframes with what was seen long ago, mend the poses of all, and the map after them."""
+        if self.loops is None or not self.loops.has_new:
+            return
+        with account.timed("loops"):
+            closed = self.loops.look(self.history)
+        if closed is not None and self.config.mapping.enabled and not self.scene.is_empty:
+            with account.timed("remapping"):
+                self._map_again(self.loops, frame)
+
+    def _map_again(self, loops: LoopCloser, frame: AdmittedFrame) -> None:
+        """Have mapped what has moved by more than half a fine voxel; the next frame to be mapped waits for it."""
+        self.wait()
+        remapping = loops.remapping(self._seen, self.history, self.config)
+        if remapping is None:
+            return
+        task = MappingTask("again", frame.index, self.history.pose(frame.index), remapping=remapping)
+        self.scheduler.start(task, self.keyframes)
+        self._take_over(wait=self._is_due(frame))
 
     def _note_motion(self, frame: AdmittedFrame) -> None:
         """Rectify the current image by how the camera came to its pose; and tell a keyframe just before of what came
@@ -400,6 +455,8 @@ class Slam:
             if self.direct is not None:  # it may be one already
                 keyframes = [keyframe for keyframe in keyframes if keyframe.index != frame.index]
             self.scheduler.start(task, keyframes)
+            if self.loops is not None:
+                self.loops.made.note(frame.index, pose)
             self._seen.append(SeenDepth.of(frame.index, depth))
             account.losses.update(self._take_over(wait=is_first))
 
@@ -408,7 +465,11 @@ class Slam:
         finished = self.scheduler.finished(wait=wait)
         if finished is None:
             return {}
-        self._mapped, result = finished
+        index, result = finished
+        if result.again and self.loops is not None:
+            self.loops.note_remapped(len(result.window), result.seconds)
+            return result.losses
+        self._mapped = index
         if result.adjusted:
             self.history.correct(self._mapped, result.pose)
             for keyframe in self.keyframes:
@@ -516,7 +577,8 @@ class Slam:
     @exclusive
     def inventory(self) -> dict[str, Any]:
         """Figures of the map for metrics.json; see `warpslam.scene.inventory.take_inventory`."""
-        return take_inventory(self.scene, self.images, self.keyframes, self._seen, self.views)
+        found = take_inventory(self.scene, self.images, self.keyframes, self._seen, self.views)
+        return found if self.loops is None else {**found, "loops": self.loops.account()}
 
     # -- saved ---------------------------------------------------------------------------------------------------
 
@@ -581,6 +643,7 @@ class Slam:
             direct=None if self.direct is None else self.direct.state(),
             digest=self._digest,
             timing_state=None if self.timing_estimator is None else self.timing_estimator.state(),
+            loops=None if self.loops is None else self.loops.state(),
             optimizer=self.mapper.state(),
         )
 
@@ -612,6 +675,11 @@ class Slam:
                 direct.fixed = len(slam.keyframes)
             if direct is not None and state.direct is not None:
                 direct.restore(state.direct, state.current)
+            slam.loops = slam._loop_closer()
+            if slam.loops is not None and state.loops is not None:
+                slam.loops.restore(state.loops)
+            elif slam.loops is not None:
+                slam.loops.take_up()
         slam.timing_estimator = slam._timing_estimator(len(slam.history))
         if slam.direct is not None and state.timing_state is not None:
             slam.timing_estimator = TimingEstimator.restored(state.timing_state, state.timing)

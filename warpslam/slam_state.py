@@ -18,6 +18,7 @@ from warpslam.field.decoders import LEVELS, Decoders, DecoderWeights, expected_s
 from warpslam.frames import check_settings
 from warpslam.kernels.decoder.layout import COLOR_WEIGHT_ROWS
 from warpslam.kernels.grid import BLOCK, BLOCK_ROWS
+from warpslam.loops.closer import LoopFigures, LoopState
 from warpslam.poses import MAX_DISTANCE, are_rigid
 from warpslam.runtime.cores import slice_count
 from warpslam.scene.feature_grid import GridState
@@ -70,6 +71,8 @@ class SlamState:
     """By which the images of the last frame are known again."""
     timing_state: TimingState | None = None
     """What the estimate of the camera's timing goes on from."""
+    loops: LoopState | None = None
+    """What the search for loops goes on from."""
     optimizer: dict[str, TouchedRowsState] = field(default_factory=dict)
     """What mapping keeps of rows that were updated, by level."""
 
@@ -126,6 +129,8 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
         "timing_estimate": None if state.timing_state is None else _timing_header(state.timing_state),
         "optimizer": list(state.optimizer),
     }
+    if state.loops is not None:
+        header["loops"] = {"seen": state.loops.seen, "figures": state.loops.figures}
     rgb, depth, scale = state.current_image
     images = [image for _, image in state.keyframes]
     keyframe_poses = [keyframe.pose for keyframe, _ in state.keyframes]
@@ -145,6 +150,8 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
         arrays |= {f"direct_{name}": array for name, array in state.direct.arrays().items()}
     if state.timing_state is not None:
         arrays["timing_blocks"] = state.timing_state.blocks
+    if state.loops is not None:
+        arrays |= {f"loops_{name}": array for name, array in state.loops.arrays.items()}
     for n, image in enumerate(images):
         arrays[f"image_{n}_rgb"] = np.frombuffer(image.rgb, np.uint8)
         arrays[f"image_{n}_depth"] = np.frombuffer(image.depth, np.uint8)
@@ -229,6 +236,7 @@ def state_from_arrays(
         direct=_direct(fields, count, len(frames)),
         digest=digest,
         timing_state=_timing_state(fields, count),
+        loops=_loops(fields, count, len(frames)),
         optimizer=_optimizer(fields, grids),
     )
 
@@ -396,6 +404,37 @@ def _timing_state(fields: StateFields, frames: int) -> TimingState | None:
         raise fields.damaged("timing_estimate", error) from None
     if not (0 <= state.first <= state.since and np.isfinite(blocks).all()):
         raise fields.damaged("timing_estimate", f"frames from {state.first}, those that count from {state.since}")
+    return state
+
+
+def _loops(fields: StateFields, count: int, keyframes: int) -> LoopState | None:
+    header = fields.header.get("loops")
+    if header is None:
+        return None
+    arrays = {}
+    for kind in ("tracked", "loop", "bridge"):
+        pairs = fields.array(f"loops_{kind}_pairs", np.int64, (None, 2)).copy()
+        if len(pairs) and (pairs.min() < 0 or pairs.max() >= keyframes or (pairs[:, 0] >= pairs[:, 1]).any()):
+            raise fields.damaged(f"loops_{kind}_pairs", f"pairs of keyframes up to {pairs.max()}, of {keyframes}")
+        arrays[f"{kind}_pairs"] = pairs
+        for name, size in (("transforms", 4), ("covariances", 6)):
+            array = fields.array(f"loops_{kind}_{name}", np.float64, (len(pairs), size, size)).copy()
+            if not np.isfinite(array).all():
+                raise fields.damaged(f"loops_{kind}_{name}", "a number that is not finite")
+            arrays[f"{kind}_{name}"] = array
+    made = arrays["made_frames"] = fields.array("loops_made_frames", np.int64, (None,)).copy()
+    if len(made) and (made.min() < 0 or made.max() >= count or len(np.unique(made)) < len(made)):
+        raise fields.damaged("loops_made_frames", f"frames up to {made.max()}, of {count}")
+    arrays["made_poses"] = fields.poses("loops_made_poses", len(made)).copy()
+    try:
+        seen = int(header["seen"])
+        figures = {name: float(value) for name, value in header["figures"].items()}
+        state = LoopState(arrays, seen, figures)
+        LoopFigures.of(figures)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise fields.damaged("loops", error) from None
+    if not 0 <= seen <= keyframes:
+        raise fields.damaged("loops", f"{seen} keyframes of {keyframes} were looked at")
     return state
 
 

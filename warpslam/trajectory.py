@@ -70,9 +70,9 @@ class Located:
     """Why the pose can't be trusted; empty if it can."""
     after_loss: bool = False
     """Whether the camera was lost before, so that poses before this one say nothing of where it may go."""
-    inliers: float = 1.0
+    inliers: float = np.nan
     """As in `FrameResult`."""
-    depth_error: float = 0.0
+    depth_error: float = np.nan
     """As in `FrameResult` [m]."""
     loss: float | None = None
     """Mean tracking loss per inlier; None for a pose that was given."""
@@ -170,7 +170,8 @@ class FrameHistory:
         # Over a gap that was bridged the speed before it is believed.
         if self._poses and (self._status[-1] is FrameStatus.OK or located.after_loss):
             self._motion = np.linalg.inv(self.last_pose) @ located.T_world_camera
-        self._append(timestamp, located.T_world_camera, FrameStatus.OK, located.depth_error)
+        measured = 0.0 if np.isnan(located.depth_error) else located.depth_error  # 0: of no use as a limit
+        self._append(timestamp, located.T_world_camera, FrameStatus.OK, measured)
 
     def skip(self, timestamp: float) -> None:
         """The next frame, in which there is nothing usable."""
@@ -224,6 +225,12 @@ class FrameHistory:
     def last_known(self) -> int | None:
         """The last frame whose pose is known and says something of where the camera is now, if there is one."""
         return next(self._known(), None)
+
+    @property
+    def lost_since_break(self) -> int:
+        """Frames that were lost since the camera may be anywhere, if none was OK; 0 otherwise."""
+        status = self._status[self._first :]
+        return 0 if FrameStatus.OK in status else status.count(FrameStatus.LOST)
 
     @property
     def was_known(self) -> bool:

@@ -136,7 +136,7 @@ def test_settings_reach_the_volume():
 def test_a_missing_package_is_named_with_what_to_type(monkeypatch):
     """Without Open3D the error says how to get it, and which libraries it wants."""
     monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install warpslam\[open3d\].*libusb-1.0-0 libgl1 libegl1"):
+    with pytest.raises(MissingDependencyError, match=r"pip install open3d.*libusb-1.0-0 libgl1 libegl1"):
         Tsdf(CAMERA)
 
 

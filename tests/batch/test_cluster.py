@@ -56,7 +56,7 @@ def test_without_ray(monkeypatch, tmp_path, capsys):
     """One line that says what to install."""
     monkeypatch.setitem(sys.modules, "ray", None)
     assert cli.main(["batch", str(tmp_path), "--cluster", "local", "-o", str(tmp_path / "out")]) == 2
-    assert "pip install 'warpslam[cluster]'" in capsys.readouterr().err
+    assert "pip install 'ray>=2.59'" in capsys.readouterr().err
 
 
 @pytest.mark.slow  # starts three Ray daemons and runs three sequences

@@ -226,7 +226,7 @@ def test_files_that_are_no_checkpoint(tmp_path, single):
     }
     for name, content in contents.items():
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(CheckpointError, match="not a torch checkpoint") as caught:
+        with pytest.raises(CheckpointError, match="not a torch checkpoint|is empty") as caught:
             load_decoders(tmp_path / name)
         assert name in str(caught.value) and "again" in str(caught.value)
     with pytest.raises(CheckpointError, match="no such file"):

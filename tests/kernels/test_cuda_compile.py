@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import re
 import shutil
 import subprocess
@@ -13,7 +14,7 @@ import warp as wp
 
 import warpslam
 from tools.benchmarks.cuda_registers import REGISTER_LIMIT, KernelResources, compiled_cubin, markdown_table, read_cubin
-from warpslam.runtime.compilation import blocks_module, find_module, module_names
+from warpslam.runtime.compilation import decoder_module, find_module, module_names
 
 ARCHITECTURES = (80, 90)
 # Bytes that may be spilled, and why they are.
@@ -49,10 +50,10 @@ def test_every_kernel_module_is_found():
 def test_a_run_compiles_every_module_beforehand():
     """What is loaded when a run starts is all there is, but for the renderer of synthetic rooms and the baseline."""
     others = {"warpslam.kernels.raycast", "warpslam.imap_cuda", "warpslam.kernels.imap_density"}
-    others |= {blocks_module("cpu"), blocks_module("cuda")}  # a map in blocks loads them
-    for target in ("cpu", "cuda"):
+    for target, layout in itertools.product(("cpu", "cuda"), ("dense", "blocks")):
         expected = {name.replace("decoder_cuda", f"decoder_{target}") for name in kernel_modules()}
-        assert set(module_names(target)) == expected - others
+        unused = decoder_module(target, "blocks" if layout == "dense" else "dense")
+        assert set(module_names(target, layout)) == expected - others - {unused}
 
 
 def cases() -> list:

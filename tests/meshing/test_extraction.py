@@ -238,7 +238,8 @@ def test_damaged_field_is_an_error(everything, poison):
 @pytest.mark.parametrize(
     ("name", "value"),
     [("voxel", 0.0), ("voxel", np.nan), ("band", -0.1), ("behind_surface", -1.0), ("level_set", np.inf)]
-    + [("min_component_area", -1.0), ("block_cells", 0)],
+    + [("min_component_area", -1.0), ("block_cells", 0), ("block_cells", np.inf), ("level_set", "x")]
+    + [("voxel", value) for value in (-(10**30), 10**400, True, "x", 1j, np.zeros(3))],
 )
 def test_bad_arguments_are_named(everything, name, value):
     """The message names the argument and its value."""

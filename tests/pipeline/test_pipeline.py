@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
+import os
+import signal
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +28,7 @@ from warpslam.report.plots import top_view_axes
 from warpslam.runs.folder import RunFolder
 from warpslam.runs.panels import load_panels
 from warpslam.runs.request import Source
+from warpslam.runtime.stopping import terminable
 from warpslam.storage.json_files import read_json, to_json
 from warpslam.storage.tum import read_tum
 
@@ -183,6 +189,74 @@ def test_second_interrupt_ends_the_writing(fake_slam, tmp_path, monkeypatch):
     monkeypatch.setattr(fake_slam, "mesh", lambda self, voxel=0.02: (_ for _ in ()).throw(KeyboardInterrupt))
     assert run_sequence(FakeSequence(4), Config(), tmp_path).status == "interrupted"
     assert "ate_m" in metrics_of(tmp_path) and (tmp_path / "trajectory.tum").exists()
+
+
+@pytest.mark.parametrize("step", ["write_trajectory", "write_map", "extract_and_write_mesh", "draw_panels"])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_first_signal_while_results_are_written_waits_for_them(fake_slam, ctrl_c, tmp_path, monkeypatch, step, number):
+    """Nothing was asked to stop before, so everything is written; the run says that it was interrupted."""
+    function = getattr(pipeline, step)
+
+    def interrupted(*arguments):
+        os.kill(os.getpid(), number)
+        time.sleep(0.01)
+        return function(*arguments)
+
+    monkeypatch.setattr(pipeline, step, interrupted)
+    with terminable():
+        before = signal.getsignal(number)
+        result = run_sequence(FakeSequence(4), Config(), tmp_path)
+        assert signal.getsignal(number) is before
+    folder = result.folder
+    assert result.status == metrics_of(tmp_path)["status"] == "interrupted"
+    assert all(path.is_file() for path in (folder.trajectory, folder.map, folder.mesh, folder.panels, folder.report))
+
+
+def test_a_signal_that_was_swallowed_ends_the_run_at_the_next_frame(fake_slam, tmp_path, monkeypatch):
+    """As imports do that catch everything. What is done by then is written, and the next run knows nothing of it."""
+    function, count = fake_slam.step, iter(range(9))
+
+    def deaf(self, *arguments, **keywords):
+        if next(count) == 1:
+            with contextlib.suppress(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(5)
+        return function(self, *arguments, **keywords)
+
+    monkeypatch.setattr(fake_slam, "step", deaf)
+    with terminable():
+        result = run_sequence(FakeSequence(4), Config(), tmp_path / "stopped")
+    assert result.status == "interrupted" and metrics_of(tmp_path / "stopped")["frames"]["processed"] == 2
+    assert run_sequence(FakeSequence(4), Config(), tmp_path / "next").status == "finished"
+
+
+def test_second_signal_ends_the_writing(fake_slam, ctrl_c, tmp_path, monkeypatch):
+    """It is not kept back."""
+
+    def impatient(*arguments):
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(5)
+
+    monkeypatch.setattr(pipeline, "write_map", impatient)
+    result = run_sequence(FakeSequence(4), Config(), tmp_path)
+    assert result.status == metrics_of(tmp_path)["status"] == "interrupted"
+    assert result.folder.trajectory.is_file() and not result.folder.mesh.exists()
+
+
+def test_every_result_has_its_name_when_it_is_whole(fake_slam, tmp_path, monkeypatch):
+    """A kill in the middle of a write leaves no half of a file under the name of a whole one."""
+    moved, move = set(), os.replace
+
+    def recorded(source, target, **keywords):
+        moved.add(Path(target).name)
+        move(source, target, **keywords)
+
+    monkeypatch.setattr(os, "replace", recorded)
+    run_sequence(FakeSequence(4), Config(), tmp_path, source=Source("somewhere"))
+    written = {path.name for path in tmp_path.iterdir()}
+    # Settings come first and are written again by a run that is resumed; this map is the fake's.
+    assert written - moved == {"config.yaml", "log.txt", "map.safetensors"} and len(moved) > 10
 
 
 def test_failure_writes_metrics_and_passes_on(fake_slam, tmp_path):

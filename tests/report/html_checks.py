@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from html.parser import HTMLParser
 
-VOID = {"meta", "link", "img", "br", "hr"}
+VOID = {"meta", "link", "img", "br", "hr", "input"}
 REFERENCES = {"src", "href", "srcset", "action", "poster", "data", "xlink:href"}
 
 
@@ -18,6 +18,7 @@ class Page(HTMLParser):
         self.problems: list[str] = []
         self.ids: list[str] = []
         self.references: list[str] = []
+        self.links: list[str] = []
         self.tags: list[str] = []
         self.headings: dict[str, str] = {}
         self.sections: dict[str, str] = {}
@@ -45,7 +46,11 @@ class Page(HTMLParser):
             self.problems.append(f"<{tag}> repeats an attribute")
         if tag == "img" and not values.get("alt"):
             self.problems.append("an image has no text in its place")
-        self.references += [value or "" for name, value in attributes if name in REFERENCES]
+        found = [value or "" for name, value in attributes if name in REFERENCES]
+        if tag == "a" and not found[0].startswith("#"):
+            self.links += found  # what one may go to is not fetched
+        else:
+            self.references += found
         self.styles += values.get("style") or ""
         self.problems += [f"<{tag}> has {name}" for name in values if name.startswith("on")]
         if "id" in values:

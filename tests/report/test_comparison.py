@@ -19,7 +19,7 @@ def test_comparison_of_runs(make_run, tmp_path):
     """A row, bars and a picture a run; the best of each figure stands out, missing ones are a dash."""
     good, bad, blind = (
         make_run("good"), make_run("bad", mesh_fails=True),
-        make_run("blind", sequence=FakeSequence(6, no_truth=tuple(range(6)))),
+        make_run("blind", sequence=FakeSequence(8, no_truth=tuple(range(8)))),
     )  # fmt: skip
     metrics = read_json(bad.metrics)
     metrics["ate_m"]["aligned"]["rmse"] = 0.5
@@ -27,7 +27,7 @@ def test_comparison_of_runs(make_run, tmp_path):
     text = write_comparison(tmp_path / "all.html", [good, bad, blind]).read_text(encoding="utf-8")
     page = Page(text)
     assert page.problems == [] and list(page.sections) == ["table", "bars", "meshes", "runs"]
-    assert page.external == ["good/report.html", "bad/report.html", "blind/report.html"]
+    assert page.links == ["good/report.html", "bad/report.html", "blind/report.html"] and page.external == []
     best = 100 * read_json(good.metrics)["ate_m"]["aligned"]["rmse"]
     assert f"<strong>{best:.2f} cm</strong>" in text and "<strong>50.00 cm</strong>" not in text
     assert "50.00 cm" in page.sections["bars"] and "–" in page.sections["table"]
@@ -58,3 +58,11 @@ def test_unwritable_page(make_run, tmp_path):
     """A place that can't be written to is named."""
     with pytest.raises(ConfigError, match="gone"):
         write_comparison(tmp_path / "gone" / "page.html", [make_run()])
+
+
+def test_no_best_over_different_frames(make_run, tmp_path):
+    """Runs over other frames are shown side by side, and none is called the best."""
+    text = write_comparison(
+        tmp_path / "all.html", [make_run("long"), make_run("short", sequence=FakeSequence(6))]
+    ).read_text(encoding="utf-8")
+    assert "went over different frames" in text and "<td><strong>" not in text

@@ -18,7 +18,7 @@ from warpslam.storage.json_files import read_json, write_json
 
 SECTIONS = (
     "figures", "trajectory", "error", "images", "mesh", "keyframes", "timing", "memory", "frames", "settings",
-    "versions",
+    "versions", "files",
 )  # fmt: skip
 
 
@@ -56,6 +56,19 @@ def test_figures_of_a_whole_run(make_run):
     assert "warpslam run somewhere --seed 0" in page.sections["settings"] and "window: 5" in page.sections["settings"]
     assert "torch" in page.sections["versions"]
     assert 'class="missing"' not in folder.report.read_text()
+
+
+def test_loops_are_drawn_and_counted(make_run):
+    """A line between the two keyframes of a loop, and what became of all candidates."""
+    folder = make_run()
+    assert "Loops:" not in report_of(folder).sections["keyframes"]
+    figures = {"candidates": 7, "geometry": 3, "registration": 2, "depth": 1, "unique": 1, "plausible": 1, "solved": 1}
+    loops = {**figures, "edges": [[0, 4]], "moved_keyframes": 3, "largest_move_m": 0.042, "seconds": 1.5}
+    write_json(folder.metrics, read_json(folder.metrics) | {"loops": loops})
+    shown = report_of(folder).sections["keyframes"]
+    assert "loop: frames 0 and 4 show one place" in shown
+    assert "7 pairs of keyframes compared; 3 passed geometry" in shown and "1 loops hold" in shown
+    assert "3 keyframes moved, by up to 4.2 cm; 1.5 s" in shown
 
 
 def test_without_ground_truth(make_run):
@@ -125,7 +138,7 @@ def test_names_from_outside_are_escaped(make_run):
     folder.config.write_text(evil)
     page = report_of(folder)
     assert page.text.count(evil) >= 6
-    data = json.loads(page.scripts[0])
+    data = json.loads(page.scripts[-2])
     assert evil in data["text"][3] and len(data["text"]) == len(data["path"]) == len(data["time"]) == 8
 
 

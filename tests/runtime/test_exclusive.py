@@ -14,7 +14,7 @@ from warpslam import cli
 from warpslam.errors import InputError
 from warpslam.runtime.exclusive import ObjectLock, exclusive
 from warpslam.runtime.program import run_slices
-from warpslam.runtime.stopping import Terminated, terminable, was_terminated
+from warpslam.runtime.stopping import Deferral, Terminated, terminable, was_terminated
 
 
 class Counter:
@@ -111,6 +111,43 @@ def test_sigterm_is_an_interrupt_with_its_own_exit_code(monkeypatch, capsys):
     monkeypatch.setattr(cli, "_parser", lambda arguments: Parser())
     assert cli.main([]) == 143
     assert "terminated" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_while_a_command_is_imported_is_a_line(ctrl_c, monkeypatch, capsys, number, code):
+    """Importing a command takes seconds; to be stopped then is no traceback either."""
+
+    def importing(arguments):
+        os.kill(os.getpid(), number)
+        time.sleep(5)
+
+    monkeypatch.setattr(cli, "_parser", importing)
+    assert cli.main([]) == code
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_the_first_signal_is_kept_back_and_the_second_is_not(ctrl_c):
+    """Of both kinds, from `defer` on; afterwards the handlers are what they were."""
+    with terminable():
+        before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+        for number, error in ((signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)):
+            with Deferral() as stopping:
+                stopping.defer()
+                assert not stopping.has_come
+                os.kill(os.getpid(), number)
+                time.sleep(0.01)
+                assert stopping.has_come and was_terminated() == (number == signal.SIGTERM)
+                stopping.defer()  # no more than one
+                with pytest.raises(error):
+                    os.kill(os.getpid(), number)
+                    time.sleep(5)
+            with pytest.raises(error), Deferral():
+                os.kill(os.getpid(), number)  # it was never asked to
+                time.sleep(5)
+            assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+    work = threading.Thread(target=Deferral().defer)  # elsewhere no handler can be set
+    work.start()
+    work.join()
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from warpslam.camera import Intrinsics
 from warpslam.sequences import open_sequence
 from warpslam.sequences.checking import ERROR, OK, WARNING, check_folder, check_sequence
 from warpslam.sequences.pose_convention import CONVENTIONS
+from warpslam.sequences.structure_checks import _EdgePoints
 from warpslam.synthetic import SyntheticSequence, write_replica
 
 CAMERA = Intrinsics(60.0, 60.0, 39.5, 29.5, 80, 60)
@@ -254,3 +255,9 @@ def test_real_recordings_are_fine(data_dir):
     for name in ("tum_fr1_xyz", "icl_livingroom1"):
         report = check_folder(data_dir / name, sample_count=4)
         assert report.errors == [] and severity_of(report, "pose convention") == OK, [str(f) for f in report.findings]
+
+
+def test_an_edge_that_leaves_the_image_proves_nothing():
+    """One point, shifted out of the image, is no division by zero."""
+    points = _EdgePoints(np.ones((1, 4, 4)), np.zeros(1, int), np.zeros(1), np.zeros(1))
+    assert points.mean(1.0, 0.0, 0.0) == 1.0 and points.mean(1.0, 5.0, 0.0) == 0.0

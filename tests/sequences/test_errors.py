@@ -26,7 +26,9 @@ def refuse(folder: Path, *patterns: str, **arguments) -> str:
 def test_missing_folder(tmp_path):
     """A path that does not exist, and one that is a file."""
     refuse(tmp_path / "nowhere", "nowhere: no such folder")
-    (tmp_path / "file").write_text("")
+    with pytest.raises(DatasetError, match="dataset = None must be the name of a format"):
+        open_sequence(tmp_path, None)
+    (tmp_path / "file").write_text("what is in it")
     refuse(tmp_path / "file", "is a file; pass the folder")
 
 

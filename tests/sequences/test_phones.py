@@ -213,7 +213,7 @@ def test_sens_that_is_cut_off_or_is_none(tmp_path):
     find(check_folder(path, sample_count=None), "frames", WARNING, "ends before")
     for content in (b"", b"\x04\x00", b"<html>" * 100, data[:200]):
         path.write_bytes(content)
-        with pytest.raises(DatasetError, match=r"a\.sens: can't be read as \.sens"):
+        with pytest.raises(DatasetError, match=r"a\.sens: can't be read (as \.sens|\(is empty)"):
             open_sequence(path)
     with pytest.raises(DatasetError, match="compression 2, 2 is not read"):
         write_sens(path, room(), depth_kind=2)

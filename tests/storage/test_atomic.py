@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from warpslam.errors import CheckpointError
 from warpslam.storage.atomic import replacing
+from warpslam.storage.state_file import StateFormat, write_state
 
 
 @pytest.mark.parametrize("error", [OSError("full"), KeyboardInterrupt()])
@@ -42,3 +44,13 @@ def test_durable_content_is_on_the_disk_before_it_has_its_name(tmp_path, monkeyp
     with replacing(tmp_path / "a.txt", durable=durable) as partial:
         partial.write_text("new")
     assert calls == order
+
+
+@pytest.mark.parametrize("name", ["", ".", "/", "a\0b", "\0/a", "\ud800"])
+def test_what_can_be_no_file_is_an_error_of_the_system(tmp_path, monkeypatch, name):
+    """Empty names, zeros, what is no letter: an `OSError`, which callers make a line of, not a `ValueError`."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OSError, match="no name of a file"), replacing(Path(name)):
+        pass
+    with pytest.raises(CheckpointError, match="can't be written"):
+        write_state(Path(name), StateFormat("test", 1), {}, {})

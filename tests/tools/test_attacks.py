@@ -4,8 +4,11 @@ import json
 import os
 import subprocess
 import sys
+import time
+from collections import Counter
 
 import numpy as np
+import psutil
 import pytest
 import warp as wp
 
@@ -21,13 +24,44 @@ def test_every_way_to_fail_is_counted(monkeypatch):
     tries after it go on.
     """
     monkeypatch.setattr(isolation, "SECONDS", 3.0)
-    account = isolation.attack("misbehaviour", misbehaviour.__name__, len(misbehaviour.WAYS))
-    assert account.tries == len(misbehaviour.WAYS)
-    assert account.outcomes == {"fine": 2, "typed error": 1}
-    kinds = (account.crashes, account.hangs, account.untyped, account.wrong)
-    assert [len(kind) for kind in kinds] == [2, 1, 2, 2]
+    account = isolation.attack("misbehaviour", misbehaviour.__name__, 20)
+    assert account.tries == len(misbehaviour.WAYS) - 1  # the last one ends its kind
+    assert account.outcomes == {"fine": 2, "typed error": 1} and account.remarks == ["remarkable"] * 2
+    kinds = (account.crashes, account.hangs, account.untyped, account.wrong, account.lost)
+    assert [len(kind) for kind in kinds] == [2, 1, 2, 2, 1]
     text = attacks.table([account])
-    assert "| misbehaviour | 10 | 2 | 1 | 2 | 2 | 1 | 2 | 0 |" in text
+    assert "| misbehaviour | 11 | 1 | 2 | 2 | 2 | 1 | 2 | 1 |" in text
+
+
+@pytest.mark.parametrize(
+    ("code", "before", "waits"),
+    [("while True: pass", 0.0, True), ("while True: pass", -9.0, False), ("import time; time.sleep(60)", 0.0, False)],
+)
+def test_a_process_that_wants_its_core_is_kept_waiting(code, before, waits):
+    """On a busy machine only what sleeps, or has had its seconds of a core, hangs."""
+    process = subprocess.Popen([sys.executable, "-c", code])
+    try:
+        time.sleep(1.0)
+        assert isolation.is_kept_waiting(psutil.Process(process.pid), before, 9.0) == waits
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_accounts_go_on_by_kind(tmp_path, monkeypatch, capsys):
+    """Kinds that a file of accounts holds are not repeated; others are added to it."""
+    asked = []
+
+    def run(name, count, seed):
+        asked.append((name, count))
+        return isolation.Account(name, Counter({"fine": count}))
+
+    monkeypatch.setattr(attacks, "KINDS", {"a": (run, 9, 1), "b": (run, 8, 2)})
+    for words in (["a"], ["a:9", "b:3"], [], ["--quick"]):
+        monkeypatch.setattr(sys, "argv", ["attacks", *words, "-o", str(tmp_path / "accounts.json")])
+        assert attacks.main() == 0
+    assert asked == [("a", 9), ("b", 3), ("b", 8)]
+    assert "| a | 9 | 0 | 9 |" in capsys.readouterr().out
 
 
 def test_hostile_numbers_reach_no_place_outside_the_arrays():

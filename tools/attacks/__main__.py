@@ -13,50 +13,24 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-
-from tools.attacks import folders, stops
+from tools.attacks import folders
 from tools.attacks.isolation import Account, attack
 
 
-def _module(module: str, memory_gb: float = 0.0, *, build: str = "usual") -> Callable[[str, int, int], Account]:
+def _module(module: str, memory_gb: float = 0.0, **options: Any) -> Callable[[str, int, int], Account]:
     def run(name: str, count: int, seed: int) -> Account:
-        return attack(name, f"tools.attacks.{module}", count, seed=seed, memory_gb=memory_gb, build=build)
+        return attack(name, f"tools.attacks.{module}", count, seed=seed, memory_gb=memory_gb, **options)
 
     return run
 
 
-def _timed(work: Callable[[Account, int, int], None]) -> Callable[[str, int, int], Account]:
-    def run(name: str, count: int, seed: int) -> Account:
-        account, start = Account(name), time.monotonic()
-        work(account, count, seed)
-        account.seconds = time.monotonic() - start
-        return account
-
-    return run
-
-
-def _kills(account: Account, count: int, seed: int) -> None:
-    """At every change of a file if there are that few, and at up to 100 moments, half as many."""
-    _, changes = stops.reference()
-    points = np.unique(np.linspace(1, changes, min(count, changes)).round().astype(int)).tolist()
-    moments = np.random.default_rng(seed).uniform(1.0, 40.0, max(1, min(count // 2, 100)))
-    stops.kill_everywhere(account, points, moments.tolist())
-
-
-def _terms(account: Account, count: int, seed: int) -> None:
-    stops.terminate(account, np.random.default_rng(seed).uniform(1.0, 40.0, count).tolist())
-
-
-def _disks(account: Account, count: int, seed: int) -> None:
-    sizes = [int(size) for size in np.geomspace(4e3, 8e6, max(count // 2, 1))]
-    for checkpoints in (True, False):
-        stops.fill_disk(account, sizes, checkpoints=checkpoints)
-
+_stops = _module("stops", seconds=600.0)  # each of its runs has a limit of its own
 
 KINDS: dict[str, tuple[Callable[[str, int, int], Account], int, int]] = {
     "kernels": (_module("kernels"), 2000, 50),
@@ -69,12 +43,15 @@ KINDS: dict[str, tuple[Callable[[str, int, int], Account], int, int]] = {
     "checkpoints": (_module("files", 4.0), 1000, 10),
     "decoders": (_module("files", 4.0), 1000, 50),
     "run folders": (_module("run_folders", 4.0), 500, 20),
-    "soak": (_module("soak"), 400, 12),
+    "soak": (_module("soak"), 200, 12),
     "threads": (_module("threads"), 20, 2),
     "forks": (_module("threads"), 20, 2),
-    "kill -9": (_timed(_kills), 1000, 6),
-    "SIGTERM": (_timed(_terms), 20, 2),
-    "full disks": (_timed(_disks), 60, 4),
+    "kill -9 at changes": (_stops, 1000, 6),
+    "kill -9 at moments": (_stops, 100, 4),
+    "kill in a write": (_stops, 30, 3),
+    "SIGTERM": (_stops, 20, 3),
+    "full disks": (_stops, 30, 3),
+    "full disks, no checkpoints": (_stops, 30, 3),
 }
 """By name: what runs it, and its tries at a release and in a quick look."""
 
@@ -82,16 +59,24 @@ KINDS: dict[str, tuple[Callable[[str, int, int], Account], int, int]] = {
 def table(accounts: list[Account]) -> str:
     """As Markdown."""
     lines = [
-        "| attack | tries | came back | refused, typed | untyped | crashes | hangs > 20 s | wrong | lost | s |",
+        "| attack | tries | refused, typed | right result | crashes | untyped | hangs > 20 s | wrong | lost | s |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for one in accounts:
         typed = one.outcomes.get("typed error", 0)
         back = sum(one.outcomes.values()) - typed
-        failures = [len(part) for part in (one.untyped, one.crashes, one.hangs, one.wrong, one.lost)]
-        cells = [one.name, one.tries, back, typed, *failures, f"{one.seconds:.0f}"]
+        failures = [len(part) for part in (one.crashes, one.untyped, one.hangs, one.wrong, one.lost)]
+        cells = [one.name, one.tries, typed, back, *failures, f"{one.seconds:.0f}"]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines)
+
+
+def _read(path: Path | None) -> dict[str, Account]:
+    """Accounts of before, by name."""
+    if path is None or not path.is_file():
+        return {}
+    accounts = [Account(**one) for one in json.loads(path.read_text())]
+    return {one.name: replace(one, outcomes=Counter(one.outcomes)) for one in accounts}
 
 
 def main() -> int:
@@ -100,21 +85,29 @@ def main() -> int:
     parser.add_argument("kinds", nargs="*", metavar="KIND[:COUNT]", help=f"of {', '.join(KINDS)} (default: all)")
     parser.add_argument("--quick", action="store_true", help="a few tries each")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("-o", "--output", type=Path, help="also write the accounts there, as JSON")
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="FILE",
+        help="also write the accounts there, as JSON; kinds that it holds in full are not repeated",
+    )  # fmt: skip
     options = parser.parse_args()
-    accounts = []
+    done = _read(options.output)
     for word in options.kinds or KINDS:
         name, _, count = word.partition(":")
         if name not in KINDS:
             parser.error(f"unknown kind {name!r}; known are {', '.join(KINDS)}")
         run, many, few = KINDS[name]
-        account = run(name, int(count) if count else few if options.quick else many, options.seed)
-        accounts.append(account)
+        wanted = int(count) if count else few if options.quick else many
+        if name in done and done[name].asked >= wanted:
+            continue
+        account = run(name, wanted, options.seed)
+        account.asked = wanted
+        done[name] = account
         print(f"{name}: {account.tries} tries, {len(account.failures)} failures, {dict(account.outcomes)}", flush=True)
         for failure in account.failures:
             print(f"  {failure}", flush=True)
         if options.output:
-            options.output.write_text(json.dumps([vars(one) for one in accounts], indent=1))
+            options.output.write_text(json.dumps([vars(one) for one in done.values()], indent=1))
+    accounts = [done[name] for name in KINDS if name in done]
     print(table(accounts))
     return 1 if any(account.failures for account in accounts) else 0
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from tests.sequences.mutations import damage
-from tests.sequences.test_fuzz import FORMATS, OWN_CAMERA
+from tests.sequences.test_fuzz import FORMATS, OWN_CAMERA, check_frame
 from tests.sequences.writers import CAMERA
 from tools.attacks.isolation import Attempt
 from warpslam.errors import DatasetError
@@ -46,7 +46,7 @@ def prepare(name: str) -> Attempt:
                 except DatasetError:
                     bad += 1
                     continue
-                assert frame.rgb.dtype == np.uint8 and np.isfinite(frame.depth).all() or dataset == "cofusion"
+                check_frame(frame, sequence, dataset, is_exact=False)
         finally:
             check_folder(folder, dataset, camera)
         return "some frames" if bad else "all frames"

@@ -9,18 +9,17 @@ import time
 
 import numpy as np
 
-from tools.attacks.isolation import Attempt
+from tools.attacks.isolation import Attempt, Lost, number_of
 from warpslam.errors import InputError
 
-WAYS = ("fine", "crash", "untyped", "wrong", "hang", "typed", "kill", "fine", "interrupt", "long")
+WAYS = ("fine", "crash", "untyped", "wrong", "hang", "typed", "kill", "fine", "interrupt", "long", "lost", "end")
 
 
 def prepare(name: str) -> Attempt:
     """One way after the other, whatever the random numbers are."""
-    numbers = [np.random.default_rng([0, n]).random() for n in range(len(WAYS))]
 
     def attempt(rng: np.random.Generator) -> str:
-        way = WAYS[numbers.index(rng.random())]
+        way = WAYS[number_of(rng)]
         if way == "crash":
             ctypes.string_at(0)
         if way == "kill":
@@ -33,8 +32,12 @@ def prepare(name: str) -> Attempt:
             raise SystemExit(3)
         if way == "typed":
             raise InputError("typed")
+        if way == "lost":
+            raise Lost("half of it")
+        if way == "end":
+            raise StopIteration
         assert way != "wrong", "wrong"
         assert way != "long", "also wrong"
-        return way
+        return f"{way}; remarkable"
 
     return attempt

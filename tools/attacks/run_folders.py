@@ -12,17 +12,23 @@ from pathlib import Path
 import numpy as np
 
 from tools.attacks import scene
-from tools.attacks.isolation import Attempt
+from tools.attacks.isolation import TYPED, Attempt
 from tools.attacks.values import mutated_bytes, mutated_json
 from warpslam import cli
-from warpslam.cli.exit_codes import EXIT_UNEXPECTED
+from warpslam.cli.exit_codes import EXIT_ERROR, EXIT_UNEXPECTED
 from warpslam.pipeline.run import run
 from warpslam.runs.request import RunRequest, Source
 from warpslam.synthetic import SyntheticSequence, write_sequence
 
 _TEXTS = ("metrics.json", "timing.json", "frames.json", "input.json", "manifest.json")
-_OTHERS = ("config.yaml", "trajectory.tum", "ground_truth.tum", "frames.csv", "panels.npz")
-_COMMANDS = (("report",), ("eval",), ("check",), ("report",), ("run", "--resume"))
+_OTHERS = (
+    "config.yaml", "trajectory.tum", "ground_truth.tum", "frames.csv", "panels.npz", "map.safetensors", "mesh.ply",
+    "log.txt", "panels.png",
+)  # fmt: skip
+_COMMANDS = (
+    ("report",), ("eval",), ("check",), ("report",), ("run", "--resume"), ("mesh", "--voxel", "0.2"),
+    ("render", "--frame", "1"),
+)  # fmt: skip
 
 
 def prepare(name: str) -> Attempt:
@@ -31,7 +37,8 @@ def prepare(name: str) -> Attempt:
     sequence = SyntheticSequence(1, 3, intrinsics=scene.CAMERA)
     write_sequence(sequence, home / "sequence")
     whole = home / "whole"
-    request = RunRequest(Source(str(home / "sequence")), overrides=scene.SMALL, preset="default", device="cpu")
+    settings = (*scene.SMALL, "meshing.voxel=0.1", "mapping.first_iterations=5", "mapping.iterations=2")
+    request = RunRequest(Source(str(home / "sequence")), overrides=settings, preset="default", device="cpu")
     run(request, whole)
 
     def attempt(rng: np.random.Generator) -> str:
@@ -52,7 +59,7 @@ def prepare(name: str) -> Attempt:
         if code == EXIT_UNEXPECTED:
             raise RuntimeError(text.strip()[-300:])
         assert len(text) < 20000, f"{len(text)} letters"
-        return f"exit {code}"
+        return TYPED if code == EXIT_ERROR else f"exit {code}"
 
     return attempt
 
@@ -64,8 +71,11 @@ def _alter(folder: Path, rng: np.random.Generator) -> None:
         return
     if rng.random() < 0.1:
         path.unlink()
-    elif text and rng.random() < 0.7:
-        value = mutated_json(json.loads(path.read_text()), rng)
-        path.write_text(json.dumps(value))
-    else:
-        path.write_bytes(mutated_bytes(path.read_bytes(), rng))
+        return
+    data = path.read_bytes()
+    if text and rng.random() < 0.7:
+        with contextlib.suppress(ValueError):  # it has been altered before
+            data = json.dumps(mutated_json(json.loads(data), rng)).encode()
+            path.write_bytes(data)
+            return
+    path.write_bytes(mutated_bytes(data, rng))

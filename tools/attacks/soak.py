@@ -13,20 +13,24 @@ from warpslam.config import Config
 from warpslam.slam import Slam
 from warpslam.synthetic import SyntheticSequence
 
-CHUNK = 50
+CHUNK = 100
 _FRAMES = 60
-_WARM = 8  # tries after which caches are filled and the map is grown
+_PATH = 400  # frames of the path that these are the first of
+_WARM = 4  # tries after which caches are filled and the map is grown
 _BYTES_A_FRAME = 40_000  # a keyframe's compact image and its rows, over the frames between two
 _CAMERA = Intrinsics(30.0, 30.0, 19.5, 14.5, 40, 30)
 _SETTINGS = (
     "tracking.pixels=64", "tracking.ignore_edge_u=2", "tracking.ignore_edge_v=2", "mapping.pixels=64",
-    "mapping.every=10", "mapping.first_iterations=20", "mapping.iterations=4", "mapping.coarse_iterations=1",
+    "mapping.every=50", "mapping.first_iterations=20", "mapping.iterations=4", "mapping.coarse_iterations=1",
+    "mapping.active_share=0", "direct.sure_correlation=0.3", "direct.sure_agreement=0.3", "direct.sure_cost=1000",
+    "direct.sure_shift=1000",
 )  # fmt: skip
+"""A frame in milliseconds: at this size most poses would be doubted, and looked for everywhere."""
 
 
 def prepare(name: str) -> Attempt:
     """There and back through a rendered room, for as long as tries are asked for."""
-    sequence = SyntheticSequence(1, _FRAMES, intrinsics=_CAMERA)
+    sequence = SyntheticSequence(1, _PATH, intrinsics=_CAMERA)
     frames = [sequence[n] for n in range(_FRAMES)]
     slam = Slam(_CAMERA, Config.from_preset("default", list(_SETTINGS)), "cpu")
     process = psutil.Process()
@@ -58,6 +62,9 @@ def prepare(name: str) -> Attempt:
         if len(times) >= 3 * _WARM:
             early, late = np.median(times[2:_WARM]), np.median(times[-_WARM:])
             assert late <= 2.5 * early, f"{1e3 * late:.0f} ms a frame after {1e3 * early:.0f} ms"
-        return f"{CHUNK} frames"
+        return (
+            f"{CHUNK} frames; {now['frames']:.0f} frames: {1e3 * times[-1]:.1f} ms a frame, {now['bytes'] / 1e6:.0f} "
+            f"MB, {now['files']:.0f} files, {now['threads']:.0f} threads, {len(slam.keyframes)} keyframes"
+        )
 
     return attempt

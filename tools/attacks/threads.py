@@ -12,7 +12,6 @@ from tools.attacks import scene
 from tools.attacks.isolation import Attempt
 
 THREADS = 4
-_SECONDS = 15.0
 
 
 def prepare(name: str) -> Attempt:
@@ -45,8 +44,7 @@ def _threads(rng: np.random.Generator) -> str:
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(60)
-        assert not thread.is_alive(), "a thread that waits for ever"
+        thread.join()  # one that waits for ever is a try that hangs
     for error in errors:
         raise error
     return "all threads came back"
@@ -67,11 +65,7 @@ def _fork(rng: np.random.Generator) -> str:
 
     process = context.Process(target=work)
     process.start()
-    process.join(_SECONDS)
-    if process.is_alive():
-        process.kill()
-        process.join()
-        raise AssertionError("a forked process hangs")
+    process.join()
     assert process.exitcode == 0, f"a forked process ended with {process.exitcode}"
     assert slam.step(frame.rgb, frame.depth).status, "the parent goes on"
     return f"child: {queue.get(timeout=5)[:60]}"

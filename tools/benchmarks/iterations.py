@@ -66,14 +66,14 @@ class Ours:
         config.middle_share, config.fine_share = STAGES[stage] if stage else (0.4, 0.6)
         config.coarse, config.bundle_adjustment = whole, whole
         keyframes = self.slam.keyframes
-        self.slam.mapper.map_frame(self.slam.images, 5, self.poses[5], keyframes)
+        self.slam.mapper.start_frame(self.slam.images, 5, self.poses[5], keyframes)()
 
     def map_first(self, iterations: int) -> None:
         """Iterations of the first frame, at its rates."""
         config = self.slam.mapper.config
         config.first_iterations, config.coarse = iterations, False
         config.middle_share, config.fine_share = 0.4, 0.6
-        self.slam.mapper.map_first(self.slam.images, 5, self.poses[5])
+        self.slam.mapper.start_first(self.slam.images, 5, self.poses[5])()
 
     def track(self, optimizer: Literal["adam", "gauss_newton"], iterations: int) -> None:
         """Tracking with a number of iterations, 200 rays."""

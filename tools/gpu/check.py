@@ -138,13 +138,13 @@ print("RESULT", json.dumps({"seconds": time.perf_counter() - t1, "import_seconds
 
 def compile_(device: str) -> Figures:
     """Each module in a process of its own, so that compiling uses all cores."""
-    from warpslam.runtime.compilation import module_names
+    from warpslam.runtime.compilation import decoder_module, module_names
     from warpslam.synthetic import RenderedSequence
 
     _bring_cache()
     target = "cpu" if device == "cpu" else "cuda"
     baseline = (f"warpslam.imap_{target}", "warpslam.kernels.imap_density")
-    names = [*module_names(target), *RenderedSequence.warp_modules, *baseline]
+    names = [*module_names(target), decoder_module(target, "blocks"), *RenderedSequence.warp_modules, *baseline]
 
     def one(name: str) -> Figures:
         done = subprocess.run([sys.executable, "-c", _LOAD, name, device], capture_output=True, text=True)
@@ -504,7 +504,7 @@ def engine_calls(engine: Any, index: int, frame: Any) -> dict[str, tuple[Callabl
 
     images, pose = engine.images, engine.history.pose(index)
     return {
-        "mapping call ms": (lambda: engine.mapper.map_frame(images, index, pose, engine.keyframes), 3),
+        "mapping call ms": (lambda: engine.mapper.start_frame(images, index, pose, engine.keyframes)(), 3),
         "track ms": (lambda: engine.tracker.track(engine.scene.arrays(), images, index, frame.T_world_camera), 10),
         "set image ms": (lambda: images.set(0, frame.rgb, frame.depth), 10),
         "keyframe image ms": (images.keep_current, 3),

@@ -343,7 +343,7 @@ def install(**options: bool) -> Runner:
     _replace(program._run_all, run_all)
     _replace(cores.slice_count, lambda device: 1)
     kernels_of = ray_batch.decoders_for
-    _replace(kernels_of, lambda device: kernels_of(SimpleNamespace(is_cuda=True)))
+    _replace(kernels_of, lambda device, layout="dense": kernels_of(SimpleNamespace(is_cuda=True), layout))
     return runner
 
 
@@ -380,10 +380,10 @@ def pytest_terminal_summary(terminalreporter: Any, config: Any) -> None:
 
 def main() -> int:
     """Translate every kernel of a run on CUDA; 1 if one can't be."""
-    from warpslam.runtime.compilation import module_names
+    from warpslam.runtime.compilation import decoder_module, module_names
 
     runner, failures = Runner(), 0
-    for name in module_names("cuda"):
+    for name in [*module_names("cuda"), decoder_module("cuda", "blocks")]:
         module = runner.module(name)
         for function in module.functions.values():
             if function.is_entry:

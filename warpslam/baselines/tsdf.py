@@ -43,7 +43,7 @@ def import_open3d() -> Any:
         import open3d
     except (ImportError, OSError) as error:
         raise MissingDependencyError(
-            f"--method tsdf needs Open3D, which can't be loaded ({error}). Type: pip install warpslam[open3d]; on "
+            f"--method tsdf needs Open3D, which can't be loaded ({error}). Type: pip install open3d; on "
             "Debian and Ubuntu it needs libraries as well: apt-get install libusb-1.0-0 libgl1 libegl1"
         ) from error
     return open3d

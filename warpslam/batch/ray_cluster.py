@@ -67,9 +67,7 @@ def run_on_ray(
     try:
         import ray
     except ImportError as error:
-        raise MissingDependencyError(
-            "--cluster needs the package ray; type: pip install 'warpslam[cluster]'"
-        ) from error
+        raise MissingDependencyError("--cluster needs the package ray; type: pip install 'ray>=2.59'") from error
     if workers is not None and workers < 1:
         raise ConfigError(f"workers = {workers} must be at least 1")
     check_jobs(jobs)

@@ -93,7 +93,7 @@ def convergence(job: Job) -> dict[str, Any]:
         curve.append([iteration + 1, error])
 
     note(None, -1, mapping.first_iterations)
-    mapper.map_first(images, 0, orthonormalized(T_world_camera), note)
+    mapper.start_first(images, 0, orthonormalized(T_world_camera), note)()
     return {"figures": {"view_depth": curve[-1][1]}, "curve": curve}
 
 
@@ -161,7 +161,7 @@ def _open(job: Job) -> tuple[RgbdSequence, Config, Iterator[tuple[Frame, np.ndar
     # Poses are used here, not given to tracking: what the settings say of it stays as it is.
     config = replace(request, poses=None).settings(sequence.preset)
     sequence = as_configured(sequence, config)
-    load_kernels(sequence, request.device)
+    load_kernels(sequence, request.device, config=config)
     given = None if request.poses is None else GivenPoses.read(request.poses)
 
     def frames() -> Iterator[tuple[Frame, np.ndarray]]:

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 
 from warpslam import __version__
 from warpslam.cli.exit_codes import EXIT_ERROR, EXIT_INTERRUPTED, EXIT_TERMINATED, EXIT_UNEXPECTED
+from warpslam.cli.parsing import Parser, nearest
 from warpslam.errors import WarpSlamError, brief, printable
 from warpslam.runtime.stopping import Terminated, terminable, was_terminated
 
@@ -31,6 +32,7 @@ COMMANDS = {
     ),
     "eval": ("evaluate", "trajectory and reconstruction errors of a run"),
     "report": ("report", "HTML report of a run, or a comparison of several"),
+    "view": ("view", "a finished run in the browser: its mesh, path and images over time"),
     "render": ("render", "a frame beside what the map renders at its pose, or the mesh along a path as a film"),
     "mesh": ("mesh", "extract the mesh of a run again"),
     "export": ("export", "the trajectory of a run in the format of another tool"),
@@ -42,8 +44,20 @@ COMMANDS = {
     "render-room": ("render_room", "rendered rooms: RGB-D sequences with their truth, and pictures"),
     "warmup": ("warmup", "compile all kernels ahead of the first run"),
     "info": ("info", "versions, devices, decoders, dataset formats, presets and settings"),
+    "completion": ("completion", "a script that completes commands in your shell"),
 }
 """Commands in the order of ``warpslam --help``: the module here whose ``add(commands)`` adds them, and what they do."""
+
+
+_EPILOG = """\
+first steps:
+  warpslam demo                 a run without data
+  warpslam check FOLDER         whether a recording can be used
+  warpslam run FOLDER --view    trajectory and mesh, watched in the browser
+
+exit codes:
+  0 done, 1 done with something to look at (check, batch, bench), 2 something
+  that you can put right, 70 an error of the program, 130 ctrl-C, 143 SIGTERM"""
 
 
 def entry_point() -> None:
@@ -66,9 +80,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str]) -> int:
-    options = _parser(arguments).parse_args(arguments)
-    options.command_line = shlex.join(["warpslam", *arguments])
+    is_debugging = False
     try:
+        options = _parser(arguments).parse_args(arguments)  # imports for seconds, in which ctrl-C may come
+        options.command_line = shlex.join(["warpslam", *arguments])
+        is_debugging = options.debug
         code: int = options.command(options)
         sys.stdout.flush()
         return code
@@ -79,7 +95,7 @@ def _main(arguments: Sequence[str]) -> int:
         print(f"warpslam: {'terminated' if isinstance(error, Terminated) else 'interrupted'}", file=sys.stderr)
         return EXIT_INTERRUPTED
     except Exception as error:
-        if options.debug:
+        if is_debugging:
             raise
         code, text = _told(error)
         print(f"warpslam: {printable(text)}", file=sys.stderr)
@@ -99,12 +115,19 @@ def _told(error: Exception) -> tuple[int, str]:
 
 def _parser(arguments: Sequence[str]) -> argparse.ArgumentParser:
     """The parser with the options of the command that is asked for, and of the others their names alone."""
-    parser = argparse.ArgumentParser(
-        prog="warpslam", description="Dense RGB-D SLAM with a neural implicit map (NICE-SLAM) in NVIDIA Warp."
+    parser = Parser(
+        prog="warpslam",
+        description="Dense RGB-D SLAM with a neural implicit map (NICE-SLAM) in NVIDIA Warp.",
+        epilog=_EPILOG,
     )
     parser.add_argument("--version", action="version", version=f"warpslam {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    wanted, _ = COMMANDS.get(next((word for word in arguments if not word.startswith("-")), ""), ("", ""))
+    word = next((word for word in arguments if not word.startswith("-")), "")
+    if word and word not in COMMANDS:
+        meant = nearest(word, COMMANDS)
+        hint = f"; did you mean {meant}?" if meant else "; all of them: warpslam --help"
+        parser.exit(EXIT_ERROR, f"warpslam: there is no command {brief(word)!r}{hint}\n")
+    wanted, _ = COMMANDS.get(word, ("", ""))
     for name, (module, text) in COMMANDS.items():
         if name in commands.choices:
             continue  # a module may add several commands

@@ -46,7 +46,7 @@ def add(commands: Any) -> None:
     batch.add_argument("--manifest", metavar="FILE", help="yaml file with sequences and their settings")
     batch.add_argument("--workers", type=int, metavar="N", help="sequences at a time (1; on a cluster: what fits)")
     batch.add_argument("--memory-gb", type=float, metavar="GB", help="stop a worker that takes more memory than this")
-    batch.add_argument("--cluster", metavar="ADDRESS", help="run on Ray: ray://HOST:10001, or local")
+    batch.add_argument("--cluster", metavar="ADDRESS", help="ray://HOST:10001 or local (Ray), slurm or slurm:PARTITION")
     add_format_options(batch)
     batch.add_argument("--preset", help="settings to start from (default: each dataset's)")
     add_config_option(batch)
@@ -67,7 +67,14 @@ def _batch(options: argparse.Namespace) -> int:
     except OSError as error:
         raise output_error(error, output) from error
     with progress() as on_update:
-        if options.cluster:
+        if options.cluster and options.cluster.partition(":")[0] == "slurm":
+            from warpslam.batch.slurm_cluster import run_on_slurm
+
+            statuses = run_on_slurm(
+                jobs, output, address=options.cluster, workers=options.workers, memory_gb=options.memory_gb,
+                on_update=on_update,
+            )  # fmt: skip
+        elif options.cluster:
             from warpslam.batch.ray_cluster import run_on_ray
 
             statuses = run_on_ray(

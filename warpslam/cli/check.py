@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from warpslam.cli.common import add_command, add_format_options, add_set_option
+from warpslam.cli.progress import working
 from warpslam.config import Config
 from warpslam.runs.folder import RunFolder
 from warpslam.runs.given_poses import GivenPoses
@@ -50,15 +51,16 @@ def _check(options: argparse.Namespace) -> int:
         return _check_run(run, options.json)
     count = None if options.all else THOROUGH_SAMPLES
     max_depth = Config.from_preset("default", options.overrides).resolved().grid.max_depth
-    report = check_folder(
-        options.folder,
-        options.dataset,
-        options.camera,
-        sample_count=count,
-        topics=options.topics,
-        max_depth=max_depth,
-        read_poses=None if options.poses is None else partial(_given, options.poses),
-    )
+    with working("reading frames"):
+        report = check_folder(
+            options.folder,
+            options.dataset,
+            options.camera,
+            sample_count=count,
+            topics=options.topics,
+            max_depth=max_depth,
+            read_poses=None if options.poses is None else partial(_given, options.poses),
+        )
     if options.json:
         print(to_json(report.to_dict()))
     else:

@@ -8,19 +8,22 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from warpslam.cli.examples import epilog
 from warpslam.cli.exit_codes import EXIT_INTERRUPTED as EXIT_INTERRUPTED
 from warpslam.config import Config
 from warpslam.errors import ConfigError
 from warpslam.pipeline.log import OneRecord
 from warpslam.pipeline.methods import DEFAULT_METHOD, METHODS
+from warpslam.pipeline.observer import Observer
 from warpslam.runs.metrics import Reconstruction, Rendering
 from warpslam.runs.request import ALL_FRAMES, Slice, parse_slice
 
 
 def add_command(commands: Any, name: str, function: Callable[[argparse.Namespace], int], text: str) -> Any:
     """Add a command that ``function`` carries out; it returns the exit code."""
-    parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-    parser.set_defaults(command=function)
+    description = text[0].upper() + text[1:] + "."
+    parser = commands.add_parser(name, help=text, description=description, epilog=epilog(name))
+    parser.set_defaults(command=function, parser=parser)
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return parser
 
@@ -44,6 +47,42 @@ def add_format_options(parser: argparse.ArgumentParser) -> None:
 def add_device_option(parser: argparse.ArgumentParser) -> None:
     """Where Warp computes."""
     parser.add_argument("--device", help="cpu, cuda:0, ... (default: a GPU if there is one)")
+
+
+def add_view_address(parser: argparse.ArgumentParser, name: str) -> None:
+    """Where a page is served."""
+    parser.add_argument(
+        name, dest="address", default="", metavar="HOST:PORT",
+        help="where the page is served (localhost:8080); 0.0.0.0:8080 lets the whole network look on",
+    )  # fmt: skip
+
+
+def add_view_options(parser: argparse.ArgumentParser) -> None:
+    """Looking on while a run goes on."""
+    parser.add_argument("--view", action="store_true", help="look on in the browser (pip install viser)")
+    add_view_address(parser, "--view-at")
+    parser.add_argument("--record", metavar="FILE.rrd", help="record it for Rerun (pip install rerun-sdk)")
+    parser.add_argument("--log", metavar="WHERE", help="figures to tensorboard:FOLDER or wandb:PROJECT")
+
+
+def viewers(options: argparse.Namespace) -> list[Observer]:
+    """Those that the options ask for."""
+    found: list[Observer] = []
+    if options.view or options.address:
+        from warpslam.viewer.live import LiveView
+        from warpslam.viewer.page import Address, require_viser
+
+        require_viser()
+        found.append(LiveView(Address.parse(options.address), lambda url: print(f"view        {url}", flush=True)))
+    if options.record:
+        from warpslam.viewer.recording import RerunRecording
+
+        found.append(RerunRecording(options.record))
+    if options.log:
+        from warpslam.viewer.figures import FigureLog
+
+        found.append(FigureLog(options.log))
+    return found
 
 
 def add_run_options(parser: argparse.ArgumentParser, output: str = "run folder (default: runs/NAME/TIME)") -> None:

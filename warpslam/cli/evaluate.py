@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from warpslam.cli.common import add_command, add_device_option, print_reconstruction, print_rendering, quiet_warp
+from warpslam.cli.progress import working
 from warpslam.evaluation import DEFAULT_PROTOCOL, PROTOCOLS
 from warpslam.pipeline.finished import evaluate_run
 from warpslam.runs.folder import RunFolder
@@ -40,15 +41,16 @@ def _eval(options: argparse.Namespace) -> int:
     protocols = [options.protocol or DEFAULT_PROTOCOL]
     if options.protocol == "all":
         protocols = sorted(PROTOCOLS, key=lambda name: name != DEFAULT_PROTOCOL)
-    figures = evaluate_run(
-        RunFolder.open(options.run),
-        options.truth,
-        max_difference=options.max_difference,
-        truth_mesh=options.truth_mesh,
-        protocols=protocols,
-        rendered_views=options.views,
-        device=options.device,
-    )
+    with working("evaluating"):
+        figures = evaluate_run(
+            RunFolder.open(options.run),
+            options.truth,
+            max_difference=options.max_difference,
+            truth_mesh=options.truth_mesh,
+            protocols=protocols,
+            rendered_views=options.views,
+            device=options.device,
+        )
     if options.json:
         print(to_json(figures))
         return 0

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from warpslam.cli.common import add_command, quiet_warp
+from warpslam.cli.progress import working
 from warpslam.storage.trajectory_files import TRAJECTORY_FORMATS
 
 
@@ -25,5 +26,7 @@ def _export(options: argparse.Namespace) -> int:
     from warpslam.runs.folder import RunFolder
 
     quiet_warp()
-    print(export_run(RunFolder.open(options.run), options.format, options.output))
+    with working("exporting"):
+        path = export_run(RunFolder.open(options.run), options.format, options.output)
+    print(path)
     return 0

@@ -80,12 +80,19 @@ def _as_text(facts: dict[str, Any]) -> str:
     counts = ", ".join(f"{level} {count:,}" for level, count in flops.items())
     lines += [
         ("devices", ", ".join(facts["devices"])),
-        ("decoders", f"{decoders['file']}, hidden width {decoders['hidden_width']}"),
+        ("decoders", f"{decoders['file']}, hidden width {_widths(decoders['hidden_width'])}"),
         ("FLOP/point", f"{counts} (middle + fine + colour); iMAP* {imap:,}"),
         ("datasets", ", ".join(facts["datasets"])),
         ("presets", ", ".join(facts["presets"])),
     ]
     return "\n".join(f"{name:11} {text}" for name, text in lines)
+
+
+def _widths(widths: dict[str, int]) -> str:
+    """One number where all levels have the same."""
+    if len(set(widths.values())) == 1:
+        return str(next(iter(widths.values())))
+    return ", ".join(f"{level} {width}" for level, width in widths.items())
 
 
 def _print_settings() -> None:

@@ -7,7 +7,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from warpslam.cli.common import add_command, add_run_options, quiet_warp, warnings_on_stderr
+from warpslam.cli.common import add_command, add_run_options, add_view_options, quiet_warp, viewers, warnings_on_stderr
 from warpslam.errors import ConfigError
 
 CAMERAS = ("realsense", "record3d")
@@ -16,6 +16,7 @@ CAMERAS = ("realsense", "record3d")
 def add(commands: Any) -> None:
     """Add the command."""
     live = add_command(commands, "live", _live, "SLAM on a camera that is plugged in; ctrl-C ends it and writes all")
+    add_view_options(live)
     live.add_argument("camera", choices=CAMERAS, metavar="CAMERA", help=" or ".join(CAMERAS))
     live.add_argument("--size", default="640x480", metavar="WxH", help="images of a RealSense (640x480)")
     live.add_argument("--rate", type=int, default=30, metavar="HZ", help="images a second of a RealSense (30)")
@@ -46,7 +47,8 @@ def _live(options: argparse.Namespace) -> int:
                 seed=options.seed,
                 max_frames=options.max_frames or MAX_FRAMES,
                 observer=observer,
-            )
+            ),
+            viewers(options),
         )
 
 

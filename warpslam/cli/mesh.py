@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from warpslam.cli.common import add_command, add_device_option, quiet_warp
+from warpslam.cli.progress import working
 
 _DEFAULT_ROUNDS = 5
 
@@ -22,6 +23,10 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     mesh.add_argument("--faces", type=int, metavar="N", help="reduce the mesh to about N faces (fast-simplification)")
     mesh.add_argument("--points", action="store_true", help="write the vertices and their colours alone, as .ply")
+    mesh.add_argument(
+        "--texture", type=int, nargs="?", const=2048, metavar="PX",
+        help="a texture PX wide (2048) in place of vertex colours, in .glb or .obj (pip install xatlas)",
+    )  # fmt: skip
     add_device_option(mesh)
     mesh.add_argument(
         "-o", "--output", metavar="FILE",
@@ -34,18 +39,19 @@ def _mesh(options: argparse.Namespace) -> int:
     from warpslam.runs.folder import RunFolder
 
     quiet_warp()
-    mesh, path = extract_mesh(
-        RunFolder.open(options.run),
-        options.voxel,
-        options.output,
-        options.device,
-        forecast=options.forecast,
-        refinement_rounds=options.refine,
-        faces=options.faces,
-        points_only=options.points,
-    )
-    extra = (
-        f", {mesh.metadata['forecast_faces']} of them forecast" if options.forecast and options.faces is None else ""
-    )
+    with working("extracting the mesh"):
+        mesh, path = extract_mesh(
+            RunFolder.open(options.run),
+            options.voxel,
+            options.output,
+            options.device,
+            forecast=options.forecast,
+            refinement_rounds=options.refine,
+            faces=options.faces,
+            points_only=options.points,
+            texture=options.texture,
+        )
+    ahead = mesh.metadata.get("forecast_faces")
+    extra = f", {ahead} of them forecast" if options.forecast and options.faces is None and ahead is not None else ""
     print(f"{path}: {len(mesh.vertices)} vertices, {len(mesh.faces)} faces{extra}")
     return 0

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from warpslam.cli.common import add_command, add_device_option, quiet_warp
+from warpslam.cli.progress import working
 
 
 def add(commands: Any) -> None:
@@ -46,19 +47,23 @@ def _render(options: argparse.Namespace) -> int:
     if options.frame is not None:
         from warpslam.pipeline.finished import render_frame
 
-        print(render_frame(folder, options.frame, options.output, options.device))
+        with working("rendering the map"):
+            path = render_frame(folder, options.frame, options.output, options.device)
+        print(path)
         return 0
     from warpslam.pipeline.film import render_film
 
-    path, count = render_film(
-        folder,
-        options.path,
-        options.output,
-        size=options.size,
-        field_of_view=options.fov,
-        frame_count=options.views,
-        rate=options.rate,
-        device=options.device,
-    )
+    with working("rendering views") as progress:
+        path, count = render_film(
+            folder,
+            options.path,
+            options.output,
+            size=options.size,
+            field_of_view=options.fov,
+            frame_count=options.views,
+            rate=options.rate,
+            device=options.device,
+            progress=progress,
+        )
     print(f"{path}: {count} views")
     return 0

@@ -9,6 +9,7 @@ from PIL import Image
 
 from warpslam.camera import Intrinsics
 from warpslam.cli.common import add_command, add_device_option, quiet_warp
+from warpslam.cli.progress import working
 from warpslam.synthetic import (
     ALTERATIONS,
     GAP_KINDS,
@@ -71,18 +72,20 @@ def _sequence(options: argparse.Namespace) -> int:
     width, height = options.size
     focal = _FOCAL * width
     camera = Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height)
-    made = make_sequence(
-        options.kind, options.seed, options.frames, intrinsics=camera, gap=options.gap, device=options.device
-    )
-    sequence = altered(made, options.alterations)
-    write_sequence(sequence, options.output)
+    with working("rendering frames"):
+        made = make_sequence(
+            options.kind, options.seed, options.frames, intrinsics=camera, gap=options.gap, device=options.device
+        )
+        sequence = altered(made, options.alterations)
+        write_sequence(sequence, options.output)
     print(f"wrote {len(sequence)} frames; run them with")
-    print(f"  warpslam run {options.output} --preset default --truth-mesh {options.output}/mesh.ply")
+    print(f"  warpslam run {options.output} --preset default --gt-mesh {options.output}/mesh.ply")
     return 0
 
 
 def _sheet(options: argparse.Namespace) -> int:
     quiet_warp()
-    Image.fromarray(contact_sheet(options.seeds, views=options.views, device=options.device)).save(options.output)
+    with working("rendering rooms"):
+        Image.fromarray(contact_sheet(options.seeds, views=options.views, device=options.device)).save(options.output)
     print(f"wrote {options.output}")
     return 0

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from warpslam.cli.common import add_command, quiet_warp, warnings_on_stderr
+from warpslam.cli.progress import working
 from warpslam.pipeline.finished import complete
 from warpslam.report import write_comparison, write_report
 from warpslam.runs.folder import RunFolder
@@ -25,10 +26,15 @@ def _report(options: argparse.Namespace) -> int:
     folders = [RunFolder.open(run) for run in options.runs]
     with warnings_on_stderr():
         for folder in folders:
-            for name in complete(folder):
+            with working("making what is missing"):
+                made = complete(folder)
+            for name in made:
                 print(f"{folder.path}: {name} was missing and is made")
     if len(folders) == 1:
-        print(write_report(folders[0], options.output))
+        with working("drawing the report"):
+            path = write_report(folders[0], options.output)
     else:
-        print(write_comparison(options.output or "comparison.html", folders))
+        with working("drawing the comparison"):
+            path = write_comparison(options.output or "comparison.html", folders)
+    print(path)
     return 0

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,18 +15,20 @@ from warpslam.cli.common import (
     add_method_option,
     add_run_options,
     add_sequence_options,
+    add_view_options,
     print_reconstruction,
     print_rendering,
     quiet_warp,
     read_config,
     slice_of,
+    viewers,
     warnings_on_stderr,
 )
+from warpslam.cli.progress import run_display
 from warpslam.errors import ConfigError
-from warpslam.frames import FrameStatus
 from warpslam.pipeline.checkpoints import read_checkpoint
 from warpslam.pipeline.finished import is_finished
-from warpslam.pipeline.observer import Observer
+from warpslam.pipeline.observer import Observer, Observers
 from warpslam.pipeline.run import run
 from warpslam.report.text import duration
 from warpslam.runs.folder import RunFolder
@@ -37,12 +37,9 @@ from warpslam.runs.request import RunRequest, Source
 from warpslam.synthetic import demo
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Sequence
 
-    from warpslam.runs.record import Progress, RunResult
-    from warpslam.runtime.compilation import ModuleProgress
-
-_PLAIN_LINES = 20
+    from warpslam.runs.record import RunResult
 
 
 def add(commands: Any) -> None:
@@ -66,6 +63,7 @@ def add(commands: Any) -> None:
     _add_poses_option(parser)
     _add_checkpoint_option(parser)
     add_run_options(parser)
+    add_view_options(parser)
 
     parser = add_command(commands, "demo", _demo, "SLAM in a small rendered room; needs no data")
     _add_overwrite_option(parser)
@@ -73,6 +71,7 @@ def add(commands: Any) -> None:
     _add_poses_option(parser)
     _add_checkpoint_option(parser)
     add_run_options(parser)
+    add_view_options(parser)
 
 
 def _add_overwrite_option(parser: argparse.ArgumentParser) -> None:
@@ -176,87 +175,26 @@ def _execute(request: RunRequest, options: argparse.Namespace, **keywords: Any) 
     quiet_warp()
     with warnings_on_stderr():
         return show_run(
-            lambda observer: run(request, options.output, observer=observer, overwrite=options.overwrite, **keywords)
+            lambda observer: run(request, options.output, observer=observer, overwrite=options.overwrite, **keywords),
+            viewers(options),
         )
 
 
-def show_run(start: Callable[[Observer], RunResult]) -> int:
-    """Start a run, show how it goes and what came of it; returns the exit code."""
-    with _display() as display:
-        result = start(display)
-    _print_summary(result)
-    return EXIT_INTERRUPTED if result.status == INTERRUPTED else 0
+def show_run(start: Callable[[Observer], RunResult], others: Sequence[Observer] = ()) -> int:
+    """Start a run, show how it goes and what came of it; returns the exit code.
 
-
-@contextmanager
-def _display() -> Iterator[Observer]:
-    """What shows frames, and modules that are compiled: a progress bar on a terminal, about twenty lines anywhere
-    else.
+    Args:
+        start: Does the run.
+        others: Look on as well.
     """
-    if not sys.stdout.isatty():
-        yield _Lines()
-        return
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
-
-    columns = (
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-        TextColumn("{task.fields[figures]}"), TextColumn("left"), TimeRemainingColumn(),
-    )  # fmt: skip
-    # rich redirects stdout and stderr while the bar is up, so warnings appear above it.
-    with Bar(*columns) as bar:
-        yield _Bar(bar)
-
-
-class _Lines(Observer):
-    """About twenty lines of text."""
-
-    def begin(self, name: str) -> None:
-        print(f"{name}: loading kernels, then mapping the first frame", flush=True)
-
-    def module(self, progress: ModuleProgress) -> None:
-        if progress.compiled and progress.seconds is None:
-            print(_compiling(progress), flush=True)
-
-    def frame(self, progress: Progress) -> None:
-        every = max(1, progress.total // _PLAIN_LINES)
-        if progress.done % every == 0 or progress.done in (1, progress.total):
-            left = (progress.total - progress.done) / progress.fps
-            print(f"frame {progress.done}/{progress.total}  {_figures(progress)}  {duration(left)} left", flush=True)
-
-
-class _Bar(Observer):
-    """A progress bar of rich."""
-
-    def __init__(self, bar: Any) -> None:
-        self._bar = bar
-
-    def begin(self, name: str) -> None:
-        self._task = self._bar.add_task(name, total=None, figures="loading kernels")
-
-    def module(self, progress: ModuleProgress) -> None:
-        figures = _compiling(progress) if progress.compiled else "loading kernels"
-        if progress.done == progress.total:
-            figures = "mapping the first frame"
-        self._bar.update(self._task, total=progress.total, completed=progress.done, figures=figures)
-
-    def frame(self, progress: Progress) -> None:
-        figures = _figures(progress) + ("  writing results" if progress.done >= progress.total else "")
-        self._bar.update(self._task, total=progress.total, completed=progress.done, figures=figures)
-
-
-def _compiling(module: ModuleProgress) -> str:
-    return f"compiling {module.name} (once a machine), {module.done} of {module.total} modules ready"
-
-
-def _figures(progress: Progress) -> str:
-    result = progress.result
-    parts = [f"{progress.fps:.2f} fps"]
-    if progress.ate_rmse is not None:
-        parts.append(f"ATE {100 * progress.ate_rmse:.2f} cm")
-    if result.status != FrameStatus.OK:
-        parts.append(result.status)
-    return "  ".join(parts)
+    try:
+        with run_display() as display:
+            result = start(Observers(display, *others))
+        _print_summary(result)
+    finally:
+        for other in others:
+            other.close()
+    return EXIT_INTERRUPTED if result.status == INTERRUPTED else 0
 
 
 def _print_summary(result: RunResult) -> None:
@@ -271,6 +209,8 @@ def _print_summary(result: RunResult) -> None:
         print(f"ATE RMSE    {100 * result.ate.rmse:.2f} cm aligned, {100 * (unaligned or 0):.2f} cm unaligned")
     if metrics.has("found_timing"):
         print(f"timing      {metrics.found_timing.text}; for camera.yaml")
+    if metrics.has("loops"):
+        print(f"loops       {metrics.loops.text}")
     size, mesh = metrics.map, metrics.mesh
     if size.bytes is not None:
         cost = f", {size.flops_per_point:,} FLOP a point" if size.flops_per_point is not None else ""

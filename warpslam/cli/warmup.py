@@ -11,7 +11,7 @@ import warp as wp
 
 from warpslam.cli.common import add_command, quiet_warp
 from warpslam.pipeline.setup import check_device
-from warpslam.runtime.compilation import ModuleProgress, compile_for_architecture, compile_kernels
+from warpslam.runtime.compilation import ModuleProgress, compile_for_architecture, compile_kernels, decoder_module
 from warpslam.synthetic import RenderedSequence
 
 _EXPLANATION = """
@@ -30,7 +30,7 @@ def add(commands: Any) -> None:
     """Add the command."""
     warmup = add_command(commands, "warmup", _warmup, "compile all kernels ahead of the first run")
     warmup.formatter_class = argparse.RawDescriptionHelpFormatter
-    warmup.epilog = _EXPLANATION
+    warmup.epilog = f"{_EXPLANATION.strip()}\n\n{warmup.epilog}"
     warmup.add_argument("--device", help="cpu, cuda, cuda:1, or an architecture: sm_80, ... (default: a GPU, or cpu)")
 
 
@@ -40,10 +40,12 @@ def _warmup(options: argparse.Namespace) -> int:
     extra = RenderedSequence.warp_modules
     architecture = re.fullmatch(r"sm_?(\d+)", options.device or "")
     if architecture:
-        modules = compile_for_architecture(int(architecture[1]), _print, extra)
+        modules = compile_for_architecture(int(architecture[1]), _print, (decoder_module("cuda", "blocks"), *extra))
     else:
         check_device(options.device)
-        modules = compile_kernels(wp.get_device(options.device), _print, extra)
+        device = wp.get_device(options.device)
+        blocks = decoder_module("cuda" if device.is_cuda else "cpu", "blocks")
+        modules = compile_kernels(device, _print, (blocks, *extra))
     compiled = sum(module.compiled for module in modules)
     print(f"{compiled} of {len(modules)} modules compiled in {time.perf_counter() - start:.1f} s")
     print(f"kernel cache {wp.config.kernel_cache_dir}")

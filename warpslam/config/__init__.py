@@ -6,6 +6,7 @@ from warpslam.config.settings import DirectConfig as DirectConfig
 from warpslam.config.settings import GridConfig as GridConfig
 from warpslam.config.settings import ImapConfig as ImapConfig
 from warpslam.config.settings import KeyframeConfig as KeyframeConfig
+from warpslam.config.settings import LoopConfig as LoopConfig
 from warpslam.config.settings import MappingConfig as MappingConfig
 from warpslam.config.settings import MeshingConfig as MeshingConfig
 from warpslam.config.settings import SamplingConfig as SamplingConfig

@@ -38,10 +38,11 @@ class GridConfig(_Group):
     middle_std: float = Field(0.01, ge=0, description="standard deviation of the initial middle features")
     fine_std: float = Field(0.0001, ge=0, description="standard deviation of the initial fine features")
     color_std: float = Field(0.01, ge=0, description="standard deviation of the initial colour features")
-    layout: Literal["dense", "blocks"] = Field(
-        "dense",
+    layout: Literal["dense", "blocks"] | None = Field(
+        None,
         description="rows of the middle, fine and colour level: one for every vertex of the map's box; or in blocks of "
-        "4 x 4 x 4 vertices where something was seen, so that memory follows that",
+        "4 x 4 x 4 vertices where something was seen, so that memory follows that; empty: blocks with the direct loss, "
+        "whose results are the same to the bit, dense with the rendering loss",
     )
     margin: float = Field(0.6, gt=0, description="the map reaches this far beyond what was seen [m]")
     max_depth: float = Field(10.0, gt=0, description="measurements beyond this do not count [m]")
@@ -239,7 +240,9 @@ class DirectConfig(_Group):
     window: int = Field(7, ge=0, le=20, description="keyframes refined when one is added; 0 = none")
     window_iterations: int = Field(2, ge=1, le=20, description="iterations of that")
     window_features: bool = Field(
-        True, description="whether features that these keyframes have in common join their refinement"
+        True,
+        description="whether features that these keyframes have in common join their refinement, once the camera's "
+        "timing is known",
     )
     keyframe_overlap: float = Field(
         0.75, gt=0, lt=1, description="a frame becomes a keyframe where it shares less with the reference"
@@ -274,6 +277,32 @@ class DirectConfig(_Group):
         "weakly determined direction, all (some 25 ms more a frame), or none",
     )
     relocalization_keyframes: int = Field(60, ge=1, description="latest keyframes that a lost camera is looked for at")
+
+
+class LoopConfig(_Group):
+    """Loops, with direct tracking: known places are recognised, and a pose graph mends what was drifted."""
+
+    enabled: bool = Field(False, description="look for loops at each keyframe; needs the package gtsam")
+    candidates: int = Field(1, ge=0, le=20, description="old keyframes that a new one is compared with by its words")
+    places: int = Field(4, ge=0, le=20, description="keyframes that a lost camera is looked for at by its words")
+    drift: float = Field(
+        0.05,
+        ge=0,
+        description="drift that tracking is believed to be capable of, as a share of the way; a loop that asks for "
+        "more is none",
+    )
+    drift_floor: float = Field(0.2, ge=0, description="and on no way at all [m]")
+    turn_drift: float = Field(0.5, ge=0, description="the same as an angle, for a metre of way [degrees]")
+    turn_floor: float = Field(5.0, ge=0, description="and on no way at all [degrees]")
+    own_part_after: int = Field(
+        10,
+        ge=0,
+        description="frames of a camera switched on in a map, in which it recognises nothing, after which it is mapped "
+        "on its own, until a place is recognised; 0 = never",
+    )
+    remapping: float = Field(
+        1.0, gt=0, description="iterations where the map is made anew, as a multiple of those that went into it"
+    )
 
 
 class KeyframeConfig(_Group):
@@ -351,6 +380,7 @@ class Config(_Group):
     sampling: SamplingConfig = Field(default_factory=SamplingConfig)
     tracking: TrackingConfig = Field(default_factory=TrackingConfig)
     direct: DirectConfig = Field(default_factory=DirectConfig)
+    loops: LoopConfig = Field(default_factory=LoopConfig)
     mapping: MappingConfig = Field(default_factory=MappingConfig)
     supervision: SupervisionConfig = Field(default_factory=SupervisionConfig)
     keyframes: KeyframeConfig = Field(default_factory=KeyframeConfig)
@@ -438,13 +468,19 @@ class Config(_Group):
 
         Poses that are given stay as they are and can be believed, so there is no bundle adjustment, and new features
         start from the measured depth unless that is off. With direct registration the tracker refines keyframes itself.
+        By the direct loss no sample lies where nothing was seen, so grids are in blocks.
         """
         given, mapping = self.tracking.use_given_poses, self.mapping
         derived = {
             "bundle_adjustment": mapping.bundle_adjustment and not given and self.tracking.optimizer != "direct",
             "depth_start": given if mapping.depth_start is None else mapping.depth_start,
         }
-        return self.model_copy(update={"mapping": mapping.model_copy(update=derived)})._at_scale()
+        layout = self.grid.layout or ("blocks" if mapping.loss == "direct" else "dense")
+        groups = {
+            "mapping": mapping.model_copy(update=derived),
+            "grid": self.grid.model_copy(update={"layout": layout}),
+        }
+        return self.model_copy(update=groups)._at_scale()
 
     def _at_scale(self) -> Config:
         """These settings with every length multiplied by ``scene_scale``, which is then 1."""

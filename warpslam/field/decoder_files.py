@@ -201,7 +201,8 @@ def _check_sums(path: Path) -> None:
                 raise CheckpointError(f"{path}: unpacks to more than any decoder has. Use another copy.")
             damaged = archive.testzip()
     except OSError as error:
-        raise CheckpointError(f"{path}: can't be read ({error.strerror or error}).") from error
+        why = error.strerror or error
+        raise CheckpointError(f"{path}: can't be read ({why}). Download or save it again.") from error
     except Exception as error:  # zipfile has many
         raise CheckpointError(f"{path}: damaged ({brief(error)}). Download or save it again.") from error
     if damaged is not None:

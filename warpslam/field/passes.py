@@ -126,7 +126,7 @@ def color_adjoint(
     result += _scatter(batch, arrays, "color", gradients, listed, stop - first)
     if gradients.color_weights is not None and batch.kernels.by_sample:
         dim = (gradients.color_weights.shape[0], WEIGHT_SECTIONS, 32)
-        result.append((batch.kernels.color_weights, dim, [listed, batch.rays, batch.color_grad, weights]))
+        result.append((_kernels(batch, arrays).color_weights, dim, [listed, batch.rays, batch.color_grad, weights]))
     return result
 
 

@@ -10,8 +10,8 @@ Adjoint for an incoming gradient dc: ``grad[place[row]] += w_corner * dc`` for r
 
 Rows are laid out in one of two ways. Dense: one for each vertex of the box, in the order of i, j, k. In blocks: the box
 is cut into blocks of 4 x 4 x 4 vertices at whole multiples of 4 of the world lattice, and only blocks that were made
-have rows, in the order in which they were made. All others share the first 64, which hold the initial features and are
-never written; initial features of blocks repeat from block to block, so that making one changes no value.
+have rows, in the order in which they were made; their features begin as those of a dense grid. All others share the
+first 64, which are random, too, and never written.
 """
 
 import warp as wp
@@ -231,7 +231,6 @@ def fill_grid(
     seed: int,
     level: int,
     std: float,
-    repeat: int,
     old: Level,
     old_seen: wp.array[wp.uint8],
     shift: wp.vec3i,
@@ -239,7 +238,7 @@ def fill_grid(
     seen: wp.array[wp.uint8],
 ):
     """Fill a dense grid of any extent: rows of the old grid are kept, the others start random (``first``: world index
-    of vertex 0), with ``repeat`` as those of blocks do.
+    of vertex 0).
     """
     i, j, k = wp.tid()
     row = row_of(lattice, i, j, k)
@@ -252,10 +251,7 @@ def fill_grid(
         features[row] = old.features[old_row]
         seen[row] = old_seen[old_row]
     else:
-        v = wp.vec3i(first[0] + i, first[1] + j, first[2] + k)
-        if repeat != 0:
-            v = wp.vec3i(v[0] & 3, v[1] & 3, v[2] & 3)
-        features[row] = init_normal(seed, level, v[0], v[1], v[2], std)
+        features[row] = init_normal(seed, level, first[0] + i, first[1] + j, first[2] + k, std)
         seen[row] = wp.uint8(0)
 
 
@@ -267,11 +263,20 @@ def fill_shared(seed: int, level: int, std: float, features: wp.array[Vec32]):
 
 
 @wp.kernel(enable_backward=False)
-def fill_blocks(start: int, features: wp.array[Vec32], seen: wp.array[wp.uint8]):
-    """Rows of new blocks, from ``start`` on."""
-    n = wp.tid()
-    features[start + n] = features[n & 63]
-    seen[start + n] = wp.uint8(0)
+def fill_rows(
+    rows: wp.array[int],
+    lattice: Lattice,
+    seed: int,
+    level: int,
+    std: float,
+    features: wp.array[Vec32],
+    seen: wp.array[wp.uint8],
+):
+    """Rows of blocks that are listed start random, as those of a dense grid."""
+    row = rows[wp.tid()]
+    v = vertex_of(lattice, row) + lattice.first
+    features[row] = init_normal(seed, level, v[0], v[1], v[2], std)
+    seen[row] = wp.uint8(0)
 
 
 @wp.kernel(enable_backward=False)

@@ -5,7 +5,8 @@
 t counts the updates of the row, and moments are kept for good: a new vertex takes bias-corrected full steps while an
 old one does not jump, and one without a gradient stands still. Rows that get a gradient are listed once each, and their
 gradients lie side by side in the order of the list, so that they stay in the cache: ``place`` leads from a row to its
-place there, -1 for all others. Moments of a row lie side by side, (rows, 2), m and v.
+place there, -1 for all others. Moments of a row lie side by side, (rows, 2), m and v. Rows that are held get gradients
+like any other, and stay what they are.
 """
 
 import warp as wp
@@ -15,6 +16,8 @@ from warpslam.kernels.grid import Lattice, Vec32, find_cell, row_of
 from warpslam.kernels.samples import Rays, sample_point
 from warpslam.kernels.supervision import MODULE
 
+HELD = wp.constant(wp.uint8(2))
+"""Of `RowState.changed`: a row that may not change."""
 BETA = wp.constant(0.99)
 LOG_BETA_1 = wp.constant(-0.105360515657826)
 LOG_BETA_2 = wp.constant(-0.010050335853501)
@@ -32,7 +35,7 @@ class Touched:
 @wp.struct
 class RowState:
     """What Adam keeps of each row: moments (rows, 2), number of updates (rows,), and whether the rows changed since the
-    call began, (rows,).
+    call began, or are `HELD`, (rows,).
     """
 
     moments: wp.array2d[Vec32]
@@ -115,7 +118,7 @@ def adam_touched(
         if not wp.isfinite(total):
             # NaN never enters the map: the row keeps its value, and the count tells.
             rejected[0] = rejected[0] + 1
-        else:
+        elif state.changed[row] != HELD:
             t = state.updates[row] + 1
             m = 0.9 * state.moments[row, 0] + 0.1 * g
             v = BETA * state.moments[row, 1] + (1.0 - BETA) * wp.cw_mul(g, g)
@@ -150,15 +153,16 @@ def adam_touched_entries(
         g += grad[slot, n, k]
         grad[slot, n, k] = 0.0
     t = state.updates[row] + 1
-    is_finite = wp.isfinite(warp_sum(wp.abs(g)))  # and all 32 threads have read the count of updates
+    is_held = state.changed[row] == HELD
+    is_finite = wp.isfinite(warp_sum(wp.abs(g)))  # and all 32 threads have read the count of updates, and that
     if k == 0:
         touched.place[row] = -1
-        if is_finite:
+        if not is_finite:
+            wp.atomic_add(rejected, 0, 1)
+        elif not is_held:
             state.updates[row] = t
             state.changed[row] = wp.uint8(1)
-        else:
-            wp.atomic_add(rejected, 0, 1)
-    if not is_finite:
+    if is_held or not is_finite:
         return
     m = 0.9 * moments[row, 0, k] + 0.1 * g
     v = BETA * moments[row, 1, k] + (1.0 - BETA) * g * g

@@ -22,7 +22,7 @@ from warpslam.field.seeds import ray_seed
 from warpslam.field.supervision import place_band, supervise
 from warpslam.kernels.supervision import Band, Target
 from warpslam.mapping.frustum import mark_seen
-from warpslam.mapping.mapper import MappingResult
+from warpslam.mapping.mapper import MappingResult, all_rows
 from warpslam.mapping.probe import Probe
 from warpslam.mapping.window import random_keyframes, replayed_keyframes
 from warpslam.poses import vector_from_pose
@@ -89,38 +89,29 @@ class DirectMapper:
         self._rows = {
             level: TouchedRows(self._launcher, scene.grids[level], capacity) for level in ("middle", "fine", "color")
         }
-        self._decoder = ColorDecoderOptimizer(self._launcher)
+        self._decoder = ColorDecoderOptimizer(self._launcher, scene.layout)
         self._decoder.begin()
+        self._free: dict[str, np.ndarray] | None = None
+        self._is_restricted = False
         self._probe = Probe(PARTS, PROBED_SHARE, settings, self._target, self._band, device, self._launcher)
         self._window = wp.zeros(PARTS, dtype=int, device=device)
         self._poses = wp.zeros((PARTS, 7), dtype=float, device=device)
 
     # -- as `Mapper` ---------------------------------------------------------------------------------------------
 
-    def map_first(
-        self, images: ImagePool, frame: int, pose: np.ndarray, on_iteration: Callable | None = None
-    ) -> MappingResult:
-        """The first frame: more iterations."""
-        return self.start_first(images, frame, pose, on_iteration)()
-
-    def map_frame(self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
-        """A later frame."""
-        return self.start_frame(images, frame, pose, keyframes)()
-
     def start_first(
         self, images: ImagePool, frame: int, pose: np.ndarray, on_iteration: Callable | None = None
     ) -> Callable[[], MappingResult]:
-        """`map_first` without waiting for the device: the function that is returned waits, and reads the outcome."""
+        """The first frame: more iterations. What is returned waits for the device, and reads the outcome."""
         return self._optimize(images, frame, pose, [], self.config.first_iterations, on_iteration=on_iteration)
 
     def start_frame(
         self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe]
     ) -> Callable[[], MappingResult]:
-        """`map_frame` without waiting for the device: the function that is returned waits, and reads the outcome."""
-        rng = np.random.default_rng([self.seed, 2, frame, 0])
-        count = round(PARTS * self.supervision.replay_share)
-        replayed = replayed_keyframes(keyframes, count, rng, images, pose, self.camera)
-        return self._optimize(images, frame, pose, replayed, self.config.iterations)
+        """A later frame. What is returned waits for the device, and reads the outcome."""
+        return self._optimize(
+            images, frame, pose, self._replayed(images, frame, pose, keyframes, 0), self.config.iterations
+        )
 
     def refine(
         self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe], rounds: range
@@ -133,8 +124,36 @@ class DirectMapper:
             result = self._optimize(images, frame, pose, window, self.config.iterations, round_=1 + round_)()
         return result
 
+    def restrict(self, free: dict[str, np.ndarray] | None, renewed: dict[str, np.ndarray]) -> None:
+        """From now on only rows that are true change, bool (rows,) by level, and no decoder; None ends it.
+
+        renewed: Rows, int (n,) by level, whose features were begun again.
+        """
+        self._fit()
+        for level, rows in self._rows.items():
+            rows.hold(None if free is None else ~free[level])
+            if level in renewed:
+                rows.forget(renewed[level])
+        self._is_restricted = free is not None
+        self._free = self._free if free is None else free  # what was free has changed, until the next call
+
+    def make_room(self, images: ImagePool, pose: np.ndarray, window: list[PlacedImage]) -> None:
+        """Have rows wherever a call on the image in slot 0 and a window may have samples."""
+        views = [PlacedImage(0, pose), *window]
+        self.scene.make_room(images.arrays, views, self.camera, reach_of(self.supervision.behind))
+
+    def map_again(
+        self, images: ImagePool, keyframe: Keyframe, keyframes: list[Keyframe], iterations: int, round_: int
+    ) -> MappingResult:
+        """Map a keyframe, whose image is in slot 0, together with others that see the same."""
+        frame, pose = keyframe.index, keyframe.pose
+        replayed = self._replayed(images, frame, pose, keyframes, round_)
+        return self._optimize(images, frame, pose, replayed, iterations, round_=round_)()
+
     def changed_rows(self) -> dict[str, wp.array]:
         """Rows of each level that the last call may have changed, int (n,); levels it left alone are absent."""
+        if self._free is not None:
+            return all_rows(self._free, self.device)
         return {level: self._rows[level].changed_rows() for level in self._rates}
 
     def state(self) -> dict[str, TouchedRowsState]:
@@ -149,6 +168,14 @@ class DirectMapper:
                 rows.restore(state[level])
         if "decoder" in state:
             self._decoder.restore(state["decoder"])
+
+    def _replayed(
+        self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe], round_: int
+    ) -> list[Keyframe]:
+        """Keyframes that share a call with a frame."""
+        rng = np.random.default_rng([self.seed, 2, frame, round_])
+        count = round(PARTS * self.supervision.replay_share)
+        return replayed_keyframes(keyframes, count, rng, images, pose, self.camera)
 
     # -- one call ------------------------------------------------------------------------------------------------
 
@@ -168,9 +195,10 @@ class DirectMapper:
         on_iteration: Callable | None = None,
     ) -> Callable[[], MappingResult]:
         """Launch a whole call; what is returned reads its outcome."""
+        if not self._is_restricted:
+            self._free = None
         slots = images.bring([one.image for one in window], [one.motion for one in window])
-        views = [PlacedImage(0, pose), *placed(window, slots)]
-        self.scene.make_room(images.arrays, views, self.camera, reach_of(self.supervision.behind))
+        self.make_room(images, pose, placed(window, slots))
         self._fit()
         for rows in self._rows.values():
             rows.begin()
@@ -189,6 +217,8 @@ class DirectMapper:
         uses += [rows.updates for rows in self._rows.values()]
         if self.config.moved_margin > 0:
             uses += [frame, round_]  # the pose is an argument of what is recorded
+        if self._is_restricted:
+            uses += ["restricted"]
         for n in range(iterations):
             self._launcher.iterate("direct", tuple(uses), partial(self._iterate, images, len(window), pose))
             if on_iteration is not None:
@@ -198,7 +228,7 @@ class DirectMapper:
     def _iterate(self, images: ImagePool, current: int, pose: np.ndarray) -> None:
         """One iteration; nothing in it may depend on its number or the frame, because it is replayed."""
         batch, arrays, launcher = self._batch, self.scene.arrays(), self._launcher
-        train_decoder = self.config.train_color_decoder
+        train_decoder = self.config.train_color_decoder and not self._is_restricted
         gradients = Gradients(
             grids={level: self._rows[level].wanted() for level in self._rates},
             color_weights=self._decoder.gradient if train_decoder else None,

@@ -57,6 +57,10 @@ class MappingResult:
     """Frame numbers of the keyframes that took part."""
     adjusted: bool = False
     """Whether poses were refined."""
+    again: bool = False
+    """Whether it was keyframes that were mapped once more, and no frame."""
+    seconds: float = 0.0
+    """That this took, in that case."""
 
 
 @dataclass
@@ -100,7 +104,7 @@ class Mapper:
         self.device, self.seed = device, seed
         self._launcher = Launcher(device)
         self._grids = {level: GridOptimizer(self._launcher) for level in LEVELS}
-        self._decoder = ColorDecoderOptimizer(self._launcher)
+        self._decoder = ColorDecoderOptimizer(self._launcher, scene.layout)
         # Refinement doubles the window; the last keyframe and the current frame come on top.
         frame_count = 2 * config.window + 2
         self._poses = PoseOptimizer(frame_count, self._launcher)
@@ -111,26 +115,20 @@ class Mapper:
         if config.active_share > 0:
             self._errors = CellErrors(frame_count, config.active_share, sampling, device, self._launcher)
         self._changed: set[str] = set()
+        self._free: dict[str, np.ndarray] | None = None
+        self._is_restricted = False
         self._depth_start: DepthStart | None = None
         if config.depth_start and config.optimize_middle:
             self._depth_start = DepthStart(scene.decoder_weights.middle, scene.grids["middle"].spacing)
         wanted = {"middle": config.optimize_middle, "fine": config.optimize_fine}
         self._frozen = {level for level, is_optimized in wanted.items() if not is_optimized}
 
-    def map_first(
-        self, images: ImagePool, frame: int, pose: np.ndarray, on_iteration: Callable | None = None
-    ) -> MappingResult:
-        """The first frame: many iterations at higher rates."""
-        return self.start_first(images, frame, pose, on_iteration)()
-
-    def map_frame(self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe]) -> MappingResult:
-        """A later frame: window, frustum selection, three stages, bundle adjustment once there are enough keyframes."""
-        return self.start_frame(images, frame, pose, keyframes)()
-
     def start_first(
         self, images: ImagePool, frame: int, pose: np.ndarray, on_iteration: Callable | None = None
     ) -> Callable[[], MappingResult]:
-        """`map_first` without waiting for the device: the function that is returned waits, and reads the outcome."""
+        """The first frame: many iterations at higher rates. What is returned waits for the device, and reads the
+        outcome.
+        """
         config = self.config
         return self._optimize(
             images, frame, pose, [], config.first_iterations, config.first_rate_factor, on_iteration=on_iteration
@@ -139,7 +137,9 @@ class Mapper:
     def start_frame(
         self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe]
     ) -> Callable[[], MappingResult]:
-        """`map_frame` without waiting for the device: the function that is returned waits, and reads the outcome."""
+        """A later frame: window, frustum selection, three stages, bundle adjustment once there are enough keyframes.
+        What is returned waits for the device, and reads the outcome.
+        """
         return self._optimize(images, frame, pose, keyframes, self.config.iterations, 1.0)
 
     def refine(
@@ -160,8 +160,33 @@ class Mapper:
             )()
         return result
 
+    def restrict(self, free: dict[str, np.ndarray] | None, renewed: dict[str, np.ndarray]) -> None:
+        """From now on only rows that are true change, bool (rows,) by level, and no decoder; None ends it.
+
+        renewed: Rows, int (n,) by level, whose features were begun again.
+        """
+        self._is_restricted = free is not None
+        self._free = self._free if free is None else free  # what was free has changed, until the next call
+
+    def make_room(self, images: ImagePool, pose: np.ndarray, window: list[PlacedImage]) -> None:
+        """Have rows wherever a call on the image in slot 0 may select vertices, and where a window has measured."""
+        if self.scene.layout == "dense":
+            return
+        margin = self.config.frustum_margin
+        current, missing = PlacedImage(0, pose), float(images.current_depth().max())
+        self.scene.make_room(images.arrays, [current], self.camera, reach_of(margin, missing), around=margin)
+        self.scene.make_room(images.arrays, window, self.camera, reach_of(0.0))
+
+    def map_again(
+        self, images: ImagePool, keyframe: Keyframe, keyframes: list[Keyframe], iterations: int, round_: int
+    ) -> MappingResult:
+        """Map a keyframe, whose image is in slot 0, together with others that see the same."""
+        return self._optimize(images, keyframe.index, keyframe.pose, keyframes, iterations, 1.0, round_=round_)()
+
     def changed_rows(self) -> dict[str, wp.array]:
         """Rows of each level that the last call may have changed, int (n,); levels it left alone are absent."""
+        if self._free is not None:
+            return all_rows(self._free, self.device)
         return {level: self._grids[level].rows for level in self._changed}
 
     def state(self) -> dict[str, TouchedRowsState]:
@@ -188,6 +213,8 @@ class Mapper:
     ) -> Callable[[], MappingResult]:
         """Launch a whole call; what is returned reads its outcome."""
         config = self.config
+        if not self._is_restricted:
+            self._free = None
         call = _Call(frame, pose, rate_factor, self._adjusts(keyframes), refinement, round_)
         coarse = self._choose_windows(call, images, keyframes)
         self._poses.begin(_vectors(call.window, pose), np.full((1, 2), config.bundle_adjustment_rate))
@@ -195,11 +222,11 @@ class Mapper:
         together = (*call.window, *coarse)
         in_use = images.bring([one.image for one in together], [one.motion for one in together])
         slots = wp.array([*in_use[: len(call.window)], 0], dtype=int, device=self.device)
-        self._make_room(images, PlacedImage(0, pose), placed(together, in_use))
+        self.make_room(images, pose, placed(together, in_use))
         self._select(images, pose, everything=refinement)
         self._launcher.forget()
 
-        if config.coarse and not refinement:
+        if config.coarse and not refinement and not self._is_restricted:
             coarse_slots = wp.array([*in_use[len(call.window) :], 0], dtype=int, device=self.device)
             coarse_poses = wp.array(_vectors(coarse, pose).astype(np.float32), dtype=float, device=self.device)
             count = config.first_iterations if not keyframes and rate_factor != 1.0 else config.coarse_iterations
@@ -213,7 +240,8 @@ class Mapper:
         """Whether poses are refined."""
         config = self.config
         enough = len(keyframes) >= config.bundle_adjustment_keyframes
-        return config.bundle_adjustment and config.bundle_adjustment_rate > 0 and enough
+        moves = config.bundle_adjustment and config.bundle_adjustment_rate > 0 and not self._is_restricted
+        return moves and enough
 
     def _choose_windows(self, call: _Call, images: ImagePool, keyframes: list[Keyframe]) -> list[Keyframe]:
         """Sets the call's window; returns that of the coarse level."""
@@ -272,15 +300,6 @@ class Mapper:
         first = "middle" if self.config.optimize_middle else "fine"
         return [first if j <= middle else "fine" if j <= fine else "color" for j in range(iterations)]
 
-    def _make_room(self, images: ImagePool, current: PlacedImage, window: list[PlacedImage]) -> None:
-        """Have rows wherever vertices may be selected, and where rays of the window are measured."""
-        if self.scene.config.layout == "dense":
-            return
-        margin = self.config.frustum_margin
-        missing = float(images.current_depth().max())
-        self.scene.make_room(images.arrays, [current], self.camera, reach_of(margin, missing), around=margin)
-        self.scene.make_room(images.arrays, window, self.camera, reach_of(0.0))
-
     def _select(self, images: ImagePool, T_world_camera: np.ndarray, *, everything: bool) -> None:
         """Which vertices of each level may change during this call; and note those that the frame has measured."""
         depth = images.metres()
@@ -294,6 +313,8 @@ class Mapper:
                 mask = select_in_frustum(
                     grid.lattice, grid.row_count, self.camera, T_world_camera, depth, self.config.frustum_margin
                 )
+            if self._is_restricted and self._free is not None:
+                mask = mask & self._free.get(level, np.zeros(grid.row_count, bool))
             optimizer.begin(grid, mask)
             if level == "middle" and self._depth_start is not None and not everything:
                 self._depth_start.apply(grid, self.camera, T_world_camera, depth, optimizer.selected)
@@ -305,7 +326,7 @@ class Mapper:
         adjust, refinement, rate_factor, T_world_camera = call.adjust, call.refinement, call.rate_factor, call.pose
         config, batch, arrays = self.config, self._batch, self.scene.arrays()
         color = stage == "color"
-        train_decoder = color and config.train_color_decoder and not refinement
+        train_decoder = color and config.train_color_decoder and not refinement and not self._is_restricted
         gradients = Gradients(
             grids={level: self._grids[level].wanted() for level in _STAGE_LEVELS[stage]},
             points=adjust and color,
@@ -379,6 +400,12 @@ class Mapper:
         """Keep the loss of the last iteration on the device until the end of the call."""
         call.ray_counts[stage] = self._batch.count
         wp.copy(self._losses, self._batch.loss, dest_offset=LEVELS.index(stage), count=1)
+
+
+def all_rows(free: dict[str, np.ndarray], device: wp.Device) -> dict[str, wp.array]:
+    """Rows that are true, bool (rows,) by level, as int (n,)."""
+    rows = {level: np.flatnonzero(mask).astype(np.int32) for level, mask in free.items()}
+    return {level: wp.array(which, dtype=int, device=device) for level, which in rows.items()}
 
 
 def _vectors(keyframes: list[Keyframe], pose: np.ndarray) -> np.ndarray:

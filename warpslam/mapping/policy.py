@@ -15,7 +15,7 @@ from warpslam.config import Config
 from warpslam.mapping.direct_mapper import DirectMapper
 from warpslam.mapping.mapper import Mapper, MappingResult
 from warpslam.scene.image_pool import ImagePool
-from warpslam.scene.keyframes import Keyframe
+from warpslam.scene.keyframes import Keyframe, PlacedImage
 from warpslam.scene.scene_map import SceneMap
 from warpslam.scene.touched_rows import TouchedRowsState
 
@@ -40,6 +40,20 @@ class MapOptimizer(Protocol):
         self, images: ImagePool, frame: int, pose: np.ndarray, keyframes: list[Keyframe], rounds: range
     ) -> MappingResult:
         """Go on with the whole map after the last frame, for several rounds, whose numbers are part of the seeds."""
+
+    def restrict(self, free: dict[str, np.ndarray] | None, renewed: dict[str, np.ndarray]) -> None:
+        """From now on only rows that are true change, bool (rows,) by level, and no decoder; None ends it.
+
+        renewed: Rows, int (n,) by level, whose features were begun again.
+        """
+
+    def make_room(self, images: ImagePool, pose: np.ndarray, window: list[PlacedImage]) -> None:
+        """Have rows wherever a call on the image in slot 0 and a window may need them."""
+
+    def map_again(
+        self, images: ImagePool, keyframe: Keyframe, keyframes: list[Keyframe], iterations: int, round_: int
+    ) -> MappingResult:
+        """Map a keyframe, whose image is in slot 0, together with others that see the same."""
 
     def changed_rows(self) -> dict[str, wp.array]:
         """Rows of each level that the last call may have changed, int (n,); levels it left alone are absent."""

@@ -30,6 +30,7 @@ import warp as wp
 
 from warpslam.mapping.mapper import MappingResult
 from warpslam.mapping.policy import MapOptimizer
+from warpslam.mapping.remapping import Remapping
 from warpslam.scene.image_pool import ImagePool
 from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.scene_map import SceneMap
@@ -43,8 +44,8 @@ _log = logging.getLogger(__name__)
 class MappingTask:
     """A frame to map, whose image is in slot 0 of the pool."""
 
-    kind: Literal["first", "frame", "refinement"]
-    """The first frame of a map, a later one, or the final refinement of the map."""
+    kind: Literal["first", "frame", "refinement", "again"]
+    """The first frame of a map, a later one, the final refinement of the map, or what a loop has moved."""
     frame: int
     """Its number."""
     pose: np.ndarray
@@ -53,6 +54,8 @@ class MappingTask:
     """Box to grow the map to, lower and upper corner [m]; None leaves the map's."""
     rounds: range = range(0)
     """Numbers of the rounds of a refinement."""
+    remapping: Remapping | None = None
+    """What is mapped again."""
 
     def start(self, mapper: MapOptimizer, images: ImagePool, keyframes: list[Keyframe]) -> Callable[[], MappingResult]:
         """Launch the work; the function that is returned waits for it and reads its outcome."""
@@ -62,6 +65,9 @@ class MappingTask:
             return mapper.start_first(images, self.frame, self.pose)
         if self.kind == "frame":
             return mapper.start_frame(images, self.frame, self.pose, keyframes)
+        if self.remapping is not None:
+            result = self.remapping.run(mapper, images, keyframes)
+            return lambda: result
         # Its rounds build on one another: it is done when they are.
         result = mapper.refine(images, self.frame, self.pose, keyframes, self.rounds)
         return lambda: result

@@ -17,13 +17,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from numbers import Real
 from typing import Any, Protocol
 
 import numpy as np
 import trimesh
 import warp as wp
 
+from warpslam.camera import is_number
 from warpslam.errors import InputError, MeshError
 from warpslam.meshing.cleaning import Hull, face_vectors, keep_faces, piece_areas, vertex_normals
 from warpslam.meshing.marching_cubes import Surface, all_corners, touched_points
@@ -219,6 +219,53 @@ def _mesh_block(
         surface.add_block(logits, forecast_cells, start, level_set, _FORECAST)
 
 
+@dataclass(frozen=True)
+class BlockMesh:
+    """The surface in a box of the lattice."""
+
+    vertices: np.ndarray
+    """Shape (V, 3) [m]."""
+    faces: np.ndarray
+    """Indices of vertices, shape (F, 3); normals point to free space."""
+    colors: np.ndarray
+    """RGBA of the vertices, uint8 (V, 4)."""
+
+
+def mesh_of_block(
+    scene: Field, evidence: Evidence, low: np.ndarray, high: np.ndarray, voxel: float, level_set: float
+) -> BlockMesh | None:
+    """The part of the surface in one block, without anything that `extract_mesh` decides by the whole.
+
+    Args:
+        scene: Field to mesh.
+        evidence: What was seen.
+        low: First lattice index (3,) int64.
+        high: Last one.
+        voxel: Lattice spacing [m].
+        level_set: Logit of the surface.
+
+    Returns:
+        None where there is no surface, or it was seen from behind only.
+
+    Raises:
+        MeshError: The field is not finite.
+    """
+    visible = evidence.visible(low * voxel, high * voxel)
+    if not len(visible):
+        return None
+    surface, x, y, z = Surface(low, high, voxel), *(int(n) for n in high - low + 1)
+    _mesh_block(scene, _Block(low, (x, y, z), visible, None), evidence, surface, voxel, level_set, _Found())
+    vertices, faces, _ = surface.merged()
+    if not len(faces):
+        return None
+    normals = vertex_normals(vertices, faces)
+    facing = evidence.facing(vertices, normals, -_FACING_MARGIN * evidence.behind)[faces].any(axis=1)
+    if not facing.any():
+        return None
+    vertices, faces = keep_faces(vertices, faces, facing)
+    return BlockMesh(vertices, faces, _query_colors(scene, vertices))
+
+
 def _front_faces(vertices: np.ndarray, faces: np.ndarray, evidence: Evidence) -> np.ndarray:
     """The faces that some view sees from the front; raises `MeshError` if there is none."""
     # Half the margin: across a rounded solid, views see some of the far inside within the whole of it.
@@ -358,13 +405,11 @@ def _check_arguments(
         ("behind_surface", behind, True),
         ("band", 1.0 if band is None else band, False),
     ):
-        if isinstance(value, bool) or not isinstance(value, Real) or abs(value) > 1e300:
-            raise InputError(f"{name} = {value!r} must be a number that is not absurd")
-        if not np.isfinite(value) or value < 0 or (value == 0 and not low_ok):
+        if not is_number(value) or value < 0 or (value == 0 and not low_ok):
             raise InputError(f"{name} = {value!r} must be a finite number {'of at least' if low_ok else 'above'} 0")
-    if not np.isfinite(level_set):
-        raise InputError(f"level_set = {level_set!r} must be finite")
-    if block_cells != int(block_cells) or block_cells < 1:
+    if not is_number(level_set):
+        raise InputError(f"level_set = {level_set!r} must be a finite number")
+    if not is_number(block_cells) or block_cells != int(block_cells) or block_cells < 1:
         raise InputError(f"block_cells = {block_cells!r} must be a whole number of at least 1")
 
 

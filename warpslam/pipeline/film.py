@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,6 +39,7 @@ def render_film(
     frame_count: int = 240,
     rate: float = 30.0,
     device: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Path, int]:
     """Render the mesh of a run along a path.
 
@@ -53,6 +54,7 @@ def render_film(
         frame_count: Views of an orbit.
         rate: Of the film [1/s].
         device: Warp device.
+        progress: Called with (views done, views).
 
     Returns:
         What was written, and how many views it holds.
@@ -73,7 +75,7 @@ def render_film(
     poses = _poses(folder, path, mesh, camera, frame_count)
     target = Path(output) if output is not None else folder.path / "film.mp4"
     renderer = MeshRenderer(mesh, camera, device=device)
-    views = (_view(renderer, T) for T in poses)
+    views = _views(renderer, poses, progress)
     if target.suffix.lower() in FILM_SUFFIXES:
         _write_film(target, views, size, rate)
     elif target.suffix.lower() == ".npz":
@@ -120,6 +122,13 @@ def _poses(folder: RunFolder, path: str, mesh: trimesh.Trimesh, camera: Intrinsi
     up = -poses[:, :3, 1].mean(axis=0)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-3 else np.array([0.0, 0.0, 1.0])
     return orbit(mesh, up, camera, count)
+
+
+def _views(renderer: MeshRenderer, poses: np.ndarray, progress: Callable[[int, int], None] | None) -> Iterator[View]:
+    for done, T in enumerate(poses, start=1):
+        yield _view(renderer, T)
+        if progress is not None:
+            progress(done, len(poses))
 
 
 def _view(renderer: MeshRenderer, T: np.ndarray) -> View:

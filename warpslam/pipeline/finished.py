@@ -21,6 +21,7 @@ from warpslam.evaluation import (
 )
 from warpslam.frames import FrameStatus
 from warpslam.meshing import check_mesh_path, point_cloud, simplified, write_mesh, write_points
+from warpslam.meshing.texture import textured, write_textured
 from warpslam.pipeline.results import render_panel, size_of_mesh
 from warpslam.pipeline.setup import as_configured, load_slam, open_source
 from warpslam.poses import transform_poses
@@ -203,6 +204,7 @@ def extract_mesh(
     refinement_rounds: int = 0,
     faces: int | None = None,
     points_only: bool = False,
+    texture: int | None = None,
 ) -> tuple[trimesh.Trimesh, Path]:
     """Extract the mesh of the final map and write it. The map itself stays as the run left it.
 
@@ -216,13 +218,14 @@ def extract_mesh(
         refinement_rounds: Rounds of the global refinement before that.
         faces: Reduce the mesh to about so many; None for all.
         points_only: Write its vertices and their colours alone.
+        texture: Width of a texture [px] in place of vertex colours; .glb and .obj have one.
 
     Raises:
         ConfigError: The method of the run has no refinement, or forecasts nothing.
         DatasetError: The run saved no map.
         InputError: The map can't be refined.
         MeshError: There is no surface, or the file can't be written.
-        MissingDependencyError: Fewer faces need the package fast-simplification.
+        MissingDependencyError: Fewer faces need the package fast-simplification, a texture xatlas.
     """
     path = check_mesh_path(output if output is not None else folder.forecast_mesh if forecast else folder.mesh)
     slam = load_slam(folder, device)
@@ -233,7 +236,14 @@ def extract_mesh(
         forecast_faces = mesh.metadata.get("forecast_faces")
         mesh = simplified(mesh, faces)
         mesh.metadata["forecast_faces"] = forecast_faces
-    written = write_points(point_cloud(mesh), path) if points_only else write_mesh(mesh, path)
+    if texture is not None:
+        scene = getattr(slam, "scene", None)
+        if scene is None:
+            raise ConfigError("the method of this run has no map to ask for the colours of a texture")
+        mesh = textured(mesh, scene.query_color, texture)
+        written = write_textured(mesh, path)
+    else:
+        written = write_points(point_cloud(mesh), path) if points_only else write_mesh(mesh, path)
     note_changed(folder, written)
     return mesh, written
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -19,11 +17,13 @@ from warpslam.pipeline.read_ahead import ReadAhead
 from warpslam.pipeline.results import trajectory_of
 from warpslam.runs.metrics import FoundTiming
 from warpslam.runs.record import Progress
+from warpslam.runtime.stopping import raise_if_terminated
 from warpslam.sequences.base import EndOfFrames
 
 if TYPE_CHECKING:
     from warpslam.frames import FrameResult
     from warpslam.pipeline.checkpoints import Checkpoints
+    from warpslam.pipeline.forecast import Forecast
     from warpslam.pipeline.methods import Method
     from warpslam.pipeline.observer import Observer
     from warpslam.runs.given_poses import GivenPoses
@@ -31,28 +31,6 @@ if TYPE_CHECKING:
     from warpslam.sequences.base import Frame, RgbdSequence
 
 log = logging.getLogger(__name__)
-_RECENT = 40  # frames, some calls of mapping among them
-
-
-class RecentRate:
-    """Frames a second of the last frames, which tell how long the others will take. The first frame, with the first
-    mapping, is like no other, and counts until there is a second.
-
-    Args:
-        start: Clock before the first frame [s].
-    """
-
-    def __init__(self, start: float) -> None:
-        self._ends = deque([start], maxlen=_RECENT + 1)
-        self._count = 0
-
-    def after_frame(self, now: float) -> float:
-        """The rate [1/s] when the clock shows ``now`` [s] at the end of a frame."""
-        self._count += 1
-        self._ends.append(now)
-        if self._count == 2:
-            self._ends.popleft()
-        return (len(self._ends) - 1) / max(self._ends[-1] - self._ends[0], 1e-9)
 
 
 @dataclass(eq=False)
@@ -82,6 +60,8 @@ class FrameLoop:
 
     checkpoints: Checkpoints
     observer: Observer
+    forecast: Forecast
+    """Of the time that is left."""
     _next_ate: int = 0
     _ate: float | None = None
 
@@ -91,9 +71,9 @@ class FrameLoop:
         Raises:
             DatasetError: Not a single frame could be used.
         """
-        rate = RecentRate(time.perf_counter())
         self.checkpoints.before_frames(self.record, self.slam)
         for frame in self._readable_frames():
+            raise_if_terminated()
             truth = _true_pose(frame)
             result = self.slam.step(
                 frame.rgb,
@@ -108,7 +88,7 @@ class FrameLoop:
             if result.sensor_timing:
                 found = FoundTiming.model_validate(found_timing(self.record, self.sequence))
                 log.info("the camera's timing was estimated: %s", found.text)
-            self.observer.frame(self._progress(result, rate.after_frame(time.perf_counter())))
+            self.observer.frame(self._progress(frame, result))
             self.checkpoints.after_frame(frame, self.record, self.slam)
         self._check_that_one_was_used()
 
@@ -147,14 +127,18 @@ class FrameLoop:
             return truth
         return truth if self.world_is_known and np.isfinite(truth).all() else None
 
-    def _progress(self, result: FrameResult, fps: float) -> Progress:
+    def _progress(self, frame: Frame, result: FrameResult) -> Progress:
         record, processed = self.record, len(self.record.results)
         # Of all poses so far, and so dearer by the frame: asked anew when there are a twentieth more, and at the end.
         if processed >= self._next_ate or record.position == len(self.selected):
             self._next_ate = processed + 1 + processed // 20
             self._ate = ate(trajectory_of(self.slam, record).poses, record.truth).rmse if record.has_truth else None
         done = processed + len(record.left_out)
-        return Progress(done, done if self.sequence.is_live else len(self.selected), result, self._ate, fps)
+        seconds_left = self.forecast.after_frame(result, done)
+        total = len(self.selected)
+        if self.sequence.is_live:  # until somebody ends it
+            total, seconds_left = done, 0.0
+        return Progress(done, total, result, self._ate, self.forecast.fps, seconds_left, frame)
 
     def _check_that_one_was_used(self) -> None:
         name, results = self.sequence.name, self.record.results
@@ -174,4 +158,5 @@ def _true_pose(frame: Frame) -> np.ndarray:
 
 def _describe(result: FrameResult) -> str:
     losses = " ".join(f"{name}={value:.4g}" for name, value in result.losses.items())
-    return f"{result.status} {losses} inliers={result.inliers:.2f} {result.message}".rstrip()
+    inliers = "" if np.isnan(result.inliers) else f"inliers={result.inliers:.2f}"
+    return " ".join(part for part in (result.status, losses, inliers, result.message) if part)

@@ -15,12 +15,15 @@ from warpslam.camera import SensorTiming
 from warpslam.frames import FrameStatus
 from warpslam.runs.record import UNREADABLE, RunRecord
 from warpslam.runtime.environment import package_versions, peak_memory_mib
+from warpslam.storage.atomic import replacing
 from warpslam.storage.json_files import write_json
 
 if TYPE_CHECKING:
     from warpslam.runs.folder import RunFolder
     from warpslam.runtime.compilation import ModuleProgress
     from warpslam.sequences.base import RgbdSequence
+
+_DIGITS = (4, 5, 4, 6, 6)  # of inliers, depth error, correlation and the two deviations in frames.csv
 
 
 def figures_of_every_run(record: RunRecord, selected_count: int, modules: Sequence[ModuleProgress]) -> dict[str, Any]:
@@ -89,12 +92,15 @@ def write_timing(folder: RunFolder, record: RunRecord, modules: Sequence[ModuleP
 def write_frames(folder: RunFolder, record: RunRecord) -> None:
     """What became of each frame: all of it for the report, and a table of it."""
     write_json(folder.frame_records, record.to_rows())
-    with open(folder.frames, "w", newline="", encoding="utf-8", errors="backslashreplace") as file:
+    with (
+        replacing(folder.frames) as partial,
+        open(partial, "w", newline="", encoding="utf-8", errors="backslashreplace") as file,
+    ):
         writer = csv.writer(file, lineterminator="\n")
         columns = ["inliers", "depth_error_m", "correlation", "sigma_m", "sigma_deg"]
         writer.writerow(["frame", "timestamp", "status", *columns, "message"])
         for index, result in record.frames:
-            figures = [f"{result.inliers:.4f}", f"{result.depth_error:.5f}"]
-            figures.append("" if result.correlation is None else f"{result.correlation:.4f}")
-            figures += ["" if math.isnan(value) else f"{value:.6f}" for value in result.sigma]
+            correlation = math.nan if result.correlation is None else result.correlation
+            measured = zip((result.inliers, result.depth_error, correlation, *result.sigma), _DIGITS, strict=True)
+            figures = ["" if math.isnan(value) else f"{value:.{digits}f}" for value, digits in measured]
             writer.writerow([index, f"{result.timestamp:.6f}", result.status, *figures, result.message])

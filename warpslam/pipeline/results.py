@@ -23,7 +23,7 @@ from warpslam.evaluation import (
 )
 from warpslam.meshing import write_mesh
 from warpslam.report.plots import plot_error, plot_panels, plot_top_view
-from warpslam.runs.panels import Panel, save_panels
+from warpslam.runs.panels import PANEL_COUNT, Panel, panel_stride, save_panels
 from warpslam.spread import spread
 from warpslam.storage.atomic import PARTIAL
 from warpslam.storage.tum import write_tum
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from warpslam.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
-PANEL_COUNT = 4
-PANEL_WIDTH = 240  # [px], at most
 
 
 def trajectory_of(slam: Method, record: RunRecord) -> Trajectory:
@@ -170,8 +168,7 @@ def draw_panels(
     """Draw a few frames beside what the map renders from their poses, and note how alike they are."""
     usable = record.usable
     positions = [usable[i] for i in spread(len(usable), PANEL_COUNT)]
-    # Small images tell as much in the figure, and rendering is slow without a GPU.
-    stride = -(-sequence.intrinsics.width // PANEL_WIDTH)
+    stride = panel_stride(sequence.intrinsics.width)
     try:
         frames = [sequence[record.frame_indices[position]] for position in positions]
     except DatasetError as error:

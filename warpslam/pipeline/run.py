@@ -20,6 +20,7 @@ from warpslam.errors import (
     WarpSlamError,
 )
 from warpslam.pipeline.checkpoints import Checkpoints, SavedRun, find_checkpoint
+from warpslam.pipeline.forecast import Forecast
 from warpslam.pipeline.log import log_file
 from warpslam.pipeline.loop import FrameLoop
 from warpslam.pipeline.methods import has_checkpoints
@@ -56,6 +57,7 @@ from warpslam.runs.metrics import RunMetrics
 from warpslam.runs.record import FAILED, FINISHED, INTERRUPTED, UNFINISHED, RunRecord, RunResult
 from warpslam.runs.request import RunRequest, SequenceFacts
 from warpslam.runtime.kernel_cache import kernel_cache_errors
+from warpslam.runtime.stopping import Deferral
 from warpslam.sequences.checking import ERROR, OK, check_sequence
 from warpslam.storage.atomic import sync_folder
 from warpslam.storage.locked_folder import locked
@@ -190,6 +192,7 @@ class Run:
 
     _marks: dict[str, tuple[int, int]] = field(default_factory=dict)
     _unwritten: Exception | None = None
+    _stopping: Deferral = field(default_factory=Deferral)
     slam: Method | None = None
     ate: AteResult | None = None
     reconstruction: ReconstructionResult | None = None
@@ -204,30 +207,39 @@ class Run:
             self.metrics.resumed_after = self.record.position
 
     def execute(self) -> RunResult:
-        """All steps, one after the other. Whatever ends them, what there is by then is written; checkpoints go last."""
+        """All steps, one after the other. Whatever ends them, what there is by then is written; checkpoints go last.
+
+        A request to stop ends the frames, or what is done to the map after them; one that comes while the results are
+        written waits for them; a second one ends that as well.
+        """
         self._marks = self.folder.marks()
-        try:
-            with self.record.clock("total"):
-                with self._interruptible():
-                    self._admit_input()
-                    self._check_input()
-                    self._build()
-                    self._process_frames()
-                    self._finish_map()
-                if self.record.results:
-                    self._write_results()
-        except KeyboardInterrupt:
-            self.status = INTERRUPTED
-        except OSError as error:
-            self._fail(error)
-            raise output_error(error, self.folder.path) from error
-        except Exception as error:
-            self._fail(error)
-            raise
-        finally:
-            self._write_account()
-        if self.status == FINISHED:
-            self._close()
+        with self._stopping:
+            try:
+                with self.record.clock("total"):
+                    with self._interruptible():
+                        self._admit_input()
+                        self._check_input()
+                        self._build()
+                        self._process_frames()
+                        self._finish_map()
+                        self._stopping.defer()
+                    if self.record.results:
+                        self._write_results()
+                    if self._stopping.has_come:
+                        self.status = INTERRUPTED
+                        log.warning("interrupted while the results were written: they are whole")
+            except KeyboardInterrupt:
+                self.status = INTERRUPTED
+            except OSError as error:
+                self._fail(error)
+                raise output_error(error, self.folder.path) from error
+            except Exception as error:
+                self._fail(error)
+                raise
+            finally:
+                self._write_account()
+            if self.status == FINISHED:
+                self._close()
         return RunResult(self.folder, self.status, self.metrics, self.ate, self.reconstruction)
 
     def _close(self) -> None:
@@ -301,7 +313,7 @@ class Run:
         request, camera, timing = self.request, self.sequence.intrinsics, self.sequence.timing
         with self.record.clock("setup"), kernel_cache_errors():
             with self.record.clock("kernel_compile"):
-                self.modules = load_kernels(self.sequence, request.device, self.observer.module)
+                self.modules = load_kernels(self.sequence, request.device, self.observer.module, self.config)
             if self.saved is not None:
                 self.slam = self.saved.slam(self.config)
                 log.info("resumed from %s, after %d frames", self.saved.path, self.record.position)
@@ -313,6 +325,7 @@ class Run:
             else:
                 self.slam = build_slam(camera, self.config, request.device, request.seed, request.method, timing)
         self.record.seconds["kernel_compile"] += self.slam.compile_seconds
+        self.observer.ready(self.slam, self.sequence)
 
     def _process_frames(self) -> None:
         assert self.slam is not None
@@ -326,6 +339,7 @@ class Run:
             world_is_known=self.request.map is None,
             checkpoints=self.checkpoints,
             observer=self.observer,
+            forecast=self._forecast(),
         )
         try:
             with self.record.clock("frames"):
@@ -334,8 +348,14 @@ class Run:
             if self.sequence.is_live:
                 self.selected = range(self.record.position)
 
+    def _forecast(self) -> Forecast:
+        assert self.slam is not None
+        count, evaluates = len(self.selected), self.truth_mesh is not None
+        return Forecast(self.config, self.sequence, self.slam, count, evaluates=evaluates)
+
     def _finish_map(self) -> None:
         assert self.slam is not None
+        self.observer.stage("refining the map")
         with self.record.clock("finish"):
             phases = self.slam.finish()
         for phase, seconds in phases.items():
@@ -346,6 +366,8 @@ class Run:
         assert self.slam is not None
         folder, slam, record, metrics = self.folder, self.slam, self.record, self.metrics
         trajectory = trajectory_of(slam, record)
+        stage = self.observer.stage
+        stage("saving")
         self._attempt(lambda: write_trajectory(folder, trajectory, record))
         self.ate = evaluate_trajectory(trajectory, record, metrics)
         self._attempt(lambda: self._write_figures(UNFINISHED))  # `warpslam report` goes by them if the rest never comes
@@ -355,11 +377,15 @@ class Run:
             metrics.fill({"mesh": {"error": "mapping.enabled is off"}})
             self._attempt(lambda: draw_plots(folder, trajectory, self.ate, record))
         else:
+            stage("extracting the mesh")
             self._attempt(lambda: extract_and_write_mesh(folder, slam, record, metrics))
+            if self.truth_mesh is not None:
+                stage("comparing the mesh with the true surface")
             self.reconstruction = evaluate_reconstruction(
                 folder, self.truth_mesh, self.sequence, trajectory, record, metrics, self.request.device
             )
             self._attempt(lambda: draw_plots(folder, trajectory, self.ate, record))
+            stage("rendering pictures")
             self._attempt(lambda: draw_panels(folder, slam, self.sequence, trajectory, record, metrics))
         if self._unwritten is not None:
             raise self._unwritten
@@ -387,6 +413,7 @@ class Run:
         """All that is written however the run ended: figures, what became of each frame, and the report."""
         try:
             self._write_figures()
+            self.observer.stage("writing the report")
             self._write_report()
         except OSError as error:
             if self.status != FAILED:
@@ -431,6 +458,7 @@ class Run:
 
     def _fail(self, error: Exception) -> None:
         """Note the failure, and save what is worth it and was not saved yet: the map where it only must not grow."""
+        self._stopping.defer()
         self.status = FAILED
         self.metrics.error = f"{type(error).__name__}: {error}"
         log.exception("the run failed")

@@ -14,6 +14,8 @@ from rich.table import Table
 from warpslam.profiling.records import Launch, Recording
 from warpslam.storage.json_files import to_json
 
+_NAME_WIDTH = 14  # at least; longer names go on in the next line
+
 
 @dataclass
 class PhaseFigures:
@@ -134,7 +136,7 @@ class Report:
         """The tables as text, ``width`` characters wide."""
         console = Console(file=io.StringIO(), width=width)
         for table in self.tables():
-            console.print(table)
+            console.print(fitted(table, width))
         assert isinstance(console.file, io.StringIO)
         return console.file.getvalue()
 
@@ -253,9 +255,22 @@ def _covered(intervals: Iterable[tuple[float, float]]) -> float:
 def _table(title: str, names: list[str], figures: list[str]) -> Table:
     table = Table(title=title, title_justify="left")
     for name in names:
-        table.add_column(name, overflow="fold")
+        table.add_column(name, overflow="fold", min_width=_NAME_WIDTH)
     for name in figures:
         table.add_column(name, justify="right", no_wrap=True)
+    return table
+
+
+def fitted(table: Table, width: int) -> Table:
+    """The table without the figures at its right end that do not fit into ``width`` characters: names never go."""
+    console = Console(width=10_000, file=io.StringIO())
+    figures = [column for column in table.columns if column.no_wrap]
+    dropped = 0
+    while len(figures) - dropped > 2 and console.measure(table).minimum > width:
+        table.columns.pop()
+        dropped += 1
+    if dropped:
+        table.caption, table.caption_justify = f"{dropped} more columns on a wider terminal, and in --json", "left"
     return table
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from warpslam.report.comparison import write_comparison as write_comparison
@@ -10,8 +11,6 @@ from warpslam.report.page import write_page
 from warpslam.report.sections import run_page
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from warpslam.runs.folder import RunFolder
 
 
@@ -26,4 +25,5 @@ def write_report(folder: RunFolder, output: str | Path | None = None) -> Path:
         DatasetError: A file of the run is damaged.
         ConfigError: The report can't be written there.
     """
-    return write_page(run_page(RunData.gather(folder)), output if output is not None else folder.report)
+    path = Path(output) if output is not None else folder.report
+    return write_page(run_page(RunData.gather(folder), path.parent), path)

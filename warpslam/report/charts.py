@@ -247,6 +247,8 @@ def _frame(
     drawn.append(element("text", x_label, x=right, y=bottom + 31, class_="label x"))
     middle = (TOP + bottom) / 2
     drawn.append(element("text", y_label, x=13, y=middle, class_="label y", transform=f"rotate(-90 13 {middle:.1f})"))
+    # On a narrow page, in place of the one that stands upright.
+    drawn.append(element("text", y_label, x=LEFT, y=TOP - 6.0, class_="label above", aria_hidden="true"))
     return element("g", drawn, class_="axes")
 
 

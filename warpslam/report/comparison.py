@@ -89,7 +89,7 @@ def run_names(runs: Sequence[RunData]) -> list[str]:
 
 
 def table_section(runs: Sequence[RunData], names: Sequence[str], base: Path) -> Html:
-    """All figures; the best of each in bold."""
+    """All figures; the best of each in bold, where runs went over the same frames."""
     shown = [figure for figure in FIGURES if any(figure.value(run.metrics) is not None for run in runs)]
     best = {figure: _best(figure, runs) for figure in shown}
     facts: list[tuple[str, Callable[[RunData], str]]] = [
@@ -112,7 +112,8 @@ def table_section(runs: Sequence[RunData], names: Sequence[str], base: Path) -> 
     head = ["run", *(title for title, _ in facts), *(figure.title for figure in shown)]
     absent = [figure.title for figure in FIGURES if figure not in shown]
     note = missing(f"No run has: {', '.join(absent)}.") if absent else None
-    return section("table", "Figures", table(head, rows, "numbers"), note)
+    differs = None if same_frames(runs) else missing("The runs went over different frames, so none is called the best.")
+    return section("table", "Figures", table(head, rows, "numbers"), differs, note)
 
 
 def bars_section(runs: Sequence[RunData], names: Sequence[str]) -> Html:
@@ -178,12 +179,20 @@ def runs_section(runs: Sequence[RunData], names: Sequence[str]) -> Html:
 
 
 def _best(figure: Figure, runs: Sequence[RunData]) -> float | None:
+    if not same_frames(runs):
+        return None
     # What a run that broke off saved in time or memory is no merit.
     finished = [run for run in runs if run.metrics.status == FINISHED]
     values = [value for run in finished if (value := figure.value(run.metrics)) is not None]
     if len(values) < 2:
         return None
     return min(values) if figure.lower_is_better else max(values)
+
+
+def same_frames(runs: Sequence[RunData]) -> bool:
+    """Whether all that came to their end went over the same frames; only then is one of them better than another."""
+    finished = [run for run in runs if run.metrics.status == FINISHED]
+    return len({(run.name, tuple(run.record.frame_indices)) for run in finished}) <= 1
 
 
 def _frames(run: RunData) -> str:

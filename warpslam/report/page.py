@@ -110,13 +110,13 @@ def page(title: str, header: str, sections: Iterable[tuple[str, str, Html]], dat
         void("meta", name="color-scheme", content="light dark"),
         void("link", rel="icon", href="data:,"),
         element("title", title),
-        element("style", Html(_asset("report.css"))),
+        element("style", Html(asset("report.css"))),
     )
     body = join(
         element("header", header, element("nav", links)),
         element("main", [content for _, _, content in sections]),
         element("script", embedded, type="application/json", id="frame-data"),
-        element("script", Html(_asset("report.js"))),
+        element("script", Html(asset("report.js"))),
     )
     return Html("<!doctype html>\n" + element("html", element("head", head), element("body", body), lang="en") + "\n")
 
@@ -141,5 +141,6 @@ def _attribute(value: object) -> str:
     return f"{value:.2f}".rstrip("0").rstrip(".") if isinstance(value, float) else str(value)
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """Text of a file of this package."""
     return resources.files("warpslam.report").joinpath(name).read_text(encoding="utf-8")

@@ -84,7 +84,7 @@ def mesh_views(mesh: trimesh.Trimesh, poses: np.ndarray, limit: int | None = Non
     # Narrow lens, far away: walls stay nearly upright in the view from above.
     narrow, wide = _camera(0.35), _camera(1.2)
     # Over the cameras' shoulders, where walls do not hide what they looked at.
-    back = _mean_backward(poses, axes)
+    back = mean_backward(poses, axes)
     aside = np.cross(axes[2], back)
     corners = [_unit(back + side * 0.8 * aside + 0.85 * axes[2]) for side in (-1, 1)]
     shown = np.concatenate([open_mesh.vertices, poses[:, :3, 3]])
@@ -104,7 +104,7 @@ def mesh_views(mesh: trimesh.Trimesh, poses: np.ndarray, limit: int | None = Non
     return pictures
 
 
-def _mean_backward(poses: np.ndarray, axes: np.ndarray) -> np.ndarray:
+def mean_backward(poses: np.ndarray, axes: np.ndarray) -> np.ndarray:
     """Level direction against the cameras' mean view; the nearer side of the picture where they looked all around."""
     back = axes[:2].T @ (axes[:2] @ -poses[:, :3, 2].mean(axis=0))
     return _unit(back) if np.linalg.norm(back) > 0.2 else -axes[1]

@@ -10,6 +10,7 @@ import numpy as np
 
 from warpslam.frames import FrameStatus
 from warpslam.runs.panels import Panel
+from warpslam.storage.atomic import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -155,4 +156,5 @@ def _figure(width: float, height: float, layout: Literal["constrained"] | None =
 
 
 def _save(figure: Any, path: str | Path) -> None:
-    figure.savefig(path, dpi=100, format="png")
+    with replacing(Path(path)) as partial:
+        figure.savefig(partial, dpi=100, format="png")

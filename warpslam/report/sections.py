@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
+from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 
@@ -22,6 +25,7 @@ from warpslam.report.data import RunData, axis_name, upright_axes
 from warpslam.report.page import Html, element, figures, join, legend, missing, page, section, table, void
 from warpslam.report.pictures import VIEW_HEIGHT, VIEW_WIDTH, MeshView, color_map, color_stops, data_uri, mesh_views
 from warpslam.report.text import centimetres, decibels, duration, number, percent
+from warpslam.report.turntable import turntable
 
 NO_TRUTH = "The sequence has no ground truth, so there is no error to measure."
 NO_POSES = "The run stopped before its first frame, so there is no trajectory."
@@ -30,8 +34,13 @@ COLOR_DIFFERENCE = 0.5
 SHOWN_OVERLAP = 0.2
 
 
-def run_page(run: RunData) -> Html:
-    """The report of a run."""
+def run_page(run: RunData, folder: Path | None = None) -> Html:
+    """The report of a run.
+
+    Args:
+        run: The run.
+        folder: Where the page will lie, for its links to files of the run; None for beside them.
+    """
     trajectory, pixels = trajectory_section(run)
     sections = [
         ("figures", "Figures", figures_section(run)),
@@ -45,6 +54,7 @@ def run_page(run: RunData) -> Html:
         ("frames", "Frames", frames_section(run)),
         ("settings", "Settings", settings_section(run)),
         ("versions", "Versions", versions_section(run)),
+        ("files", "Files", files_section(run, folder)),
     ]
     return page(f"{run.name} · warpslam", run_header(run), sections, _cursor_data(run, pixels))
 
@@ -279,6 +289,7 @@ def mesh_section(run: RunData) -> Html:
     if size.area_m2 is not None:
         facts.append(f"{size.area_m2:.1f} m² of surface")
     views = element("div", [_mesh_figure(view, n == 0) for n, view in enumerate(views_of(run))], class_="views")
+    canvas = turntable(load_mesh(run.folder.mesh), run.poses if len(run.poses) else np.eye(4)[None])
     rows: list[list[str]] = []
     if surface.error is not None:
         facts.append(f"not compared with the true surface: {surface.error}")
@@ -291,7 +302,8 @@ def mesh_section(run: RunData) -> Html:
             ["Completion", centimetres(surface.completion_m) or "–", "from the true surface to the mesh"],
             ["Completion ratio", "–" if ratio is None else percent(ratio), "of the true surface within 5 cm"],
         ]
-    return section("mesh", title, element("p", " · ".join(facts)), views, table(("", "", ""), rows) if rows else None)
+    figures = table(("", "", ""), rows) if rows else None
+    return section("mesh", title, element("p", " · ".join(facts)), canvas, views, figures)
 
 
 def views_of(run: RunData, limit: int | None = None) -> list[MeshView]:
@@ -314,6 +326,26 @@ def _mesh_figure(view: MeshView, first: bool) -> Html:
     return element("figure", drawing, element("figcaption", view.title + note))
 
 
+def files_section(run: RunData, folder: Path | None = None) -> Html:
+    """Links to what the run wrote, as long as the page lies where it was written."""
+    files = run.folder
+    entries = [
+        (files.mesh, "mesh"), (files.trajectory, "camera poses (TUM: time, position, quaternion x y z w)"),
+        (files.ground_truth, "true poses of these frames"), (files.config, "settings, for --config"),
+        (files.metrics, "all figures"), (files.frames, "table of the frames"), (files.timing, "times"),
+        (files.map, "map, for --map"), (files.log, "what happened"),
+    ]  # fmt: skip
+    base = (folder or files.path).absolute()
+    items = [
+        element("li", element("a", path.name, href=quote(os.path.relpath(path.absolute(), base))), " ",
+                element("span", what))
+        for path, what in entries if path.is_file()
+    ]  # fmt: skip
+    if not items:
+        return section("files", "Files", missing("The run left no other files."))
+    return section("files", "Files", element("ul", items, class_="files"))
+
+
 def keyframes_section(run: RunData) -> Html:
     """Keyframes along the path, and which of them see the same."""
     title = "Keyframes"
@@ -333,6 +365,12 @@ def keyframes_section(run: RunData) -> Html:
         (a, b, share, f"frames {numbers[frames[a]]} and {numbers[frames[b]]}: {percent(share)} in common")
         for a, b, share in pairs
     ]
+    number_of = {frame: n for n, frame in enumerate(frames)}
+    loops = [pair for pair in run.metrics.loops.edges if all(frame in number_of for frame in pair)]
+    links += [
+        (number_of[a], number_of[b], 1.0, f"loop: frames {numbers[a]} and {numbers[b]} show one place")
+        for a, b in loops
+    ]
     chart, _ = charts.ground_chart(
         "Keyframes from above", [("faint", "camera path", ground)],
         axis_names=(axis_name(axes[0]), axis_name(axes[1])), points=points, links=links,
@@ -341,7 +379,10 @@ def keyframes_section(run: RunData) -> Html:
         f"{len(frames)} keyframes; {len(pairs)} pairs see at least {100 * SHOWN_OVERLAP:.0f} % of the same space. "
         "The stronger a line, the more they share."
     )
-    return section("keyframes", title, element("figure", chart, element("figcaption", caption)))
+    content: list[Html] = [element("figure", chart, element("figcaption", caption))]
+    if run.metrics.has("loops"):
+        content.append(element("p", f"Loops: {run.metrics.loops.text}."))
+    return section("keyframes", title, content)
 
 
 def _cursor_data(run: RunData, pixels: np.ndarray | None) -> str:

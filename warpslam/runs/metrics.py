@@ -153,6 +153,44 @@ class Keyframes(_Part):
     )
 
 
+class Loops(_Part):
+    """Places that were recognised, and what followed."""
+
+    keyframes: int = Field(0, description="keyframes that were compared with older ones")
+    candidates: int = Field(0, description="pairs of keyframes that were compared")
+    geometry: int = Field(0, description="of them, pairs that one pose fits the features of, or the poses themselves")
+    registration: int = Field(0, description="of these, pairs that registration confirms both ways")
+    depth: int = Field(0, description="of these, pairs of which neither measured what the other saw empty")
+    unique: int = Field(0, description="of these, pairs that look like nowhere else")
+    plausible: int = Field(0, description="of these, loops: tracking may have drifted by what they say")
+    switched_off: int = Field(0, description="of these, loops that all others contradict")
+    solved: int = Field(0, description="times that poses were mended")
+    moved_keyframes: int = Field(0, description="keyframes that moved, summed over these")
+    largest_move_m: Number = Field(None, description="of one keyframe at once [m]")
+    joined: int = Field(0, description="times that parts which nothing else joins were joined")
+    apart_keyframes: int = Field(0, description="keyframes of parts that nothing joins to the first one")
+    remapped: int = Field(0, description="times that a part of the map was made anew")
+    remapped_keyframes: int = Field(0, description="keyframes that it was made of, summed over these")
+    edges: list[tuple[int, int]] = Field(default_factory=list, description="loops: frames among those processed")
+    seconds: Number = Field(None, description="spent, since the start or the last resume [s]")
+    remapping_seconds: Number = Field(None, description="spent on making the map anew, likewise [s]")
+
+    @property
+    def text(self) -> str:
+        """In a line."""
+        passed = ", ".join(
+            f"{getattr(self, gate)} passed {gate}" for gate in ("geometry", "registration", "depth", "unique")
+        )
+        apart = f"; {self.apart_keyframes} keyframes lie apart" if self.apart_keyframes else ""
+        joined = f"; parts joined {self.joined} times" if self.joined else ""
+        return (
+            f"{self.candidates} pairs of keyframes compared; {passed}; {len(self.edges)} loops hold; poses mended "
+            f"{self.solved} times, {self.moved_keyframes} keyframes moved, by up to "
+            f"{100 * (self.largest_move_m or 0):.1f} cm; {self.seconds or 0:.1f} s; made anew {self.remapped} times of "
+            f"{self.remapped_keyframes} keyframes, {self.remapping_seconds or 0:.1f} s{joined}{apart}"
+        )
+
+
 class Memory(_Part):
     """State that makes the map."""
 
@@ -257,6 +295,7 @@ class RunMetrics(Errors):
     bounds_m: list[list[Number]] | None = Field(None, description="lower and upper corner of the grids [m]")
     observed_volume_m3: Number = Field(None, description="cells that depth rays of mapped frames crossed [m^3]")
     keyframes: Keyframes = _part(Keyframes, "keyframes")
+    loops: Loops = _part(Loops, "places that were recognised; left out where none were looked for")
     memory: Memory = _part(Memory, "state that makes the map")
     mesh: Mesh = _part(Mesh, "mesh that was written")
     error: str | None = Field(None, description="what ended a run that failed")

@@ -5,10 +5,21 @@ from __future__ import annotations
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from warpslam.errors import DatasetError
+from warpslam.storage.atomic import replacing
+
+PANEL_COUNT = 4
+"""Frames of a run that are shown beside what its map renders."""
+_WIDTH = 240  # [px], at most: small images tell as much in the figure, and rendering is slow without a GPU
+
+
+def panel_stride(width: int) -> int:
+    """Every so many pixels of images that are ``width`` wide are rendered for a panel."""
+    return -(-width // _WIDTH)
 
 
 @dataclass(frozen=True)
@@ -37,14 +48,18 @@ def save_panels(path: Path, panels: list[Panel]) -> None:
     def millimetres(depth: np.ndarray) -> np.ndarray:
         return np.rint(np.clip(np.nan_to_num(depth) * 1000, 0, 65535)).astype(np.uint16)
 
-    np.savez_compressed(
-        path,
-        index=np.array([panel.index for panel in panels]),
-        rgb=np.stack([panel.rgb for panel in panels]),
-        depth=np.stack([millimetres(panel.depth) for panel in panels]),
-        rendered_rgb=np.stack([np.rint(np.clip(panel.rendered_rgb, 0, 1) * 255).astype(np.uint8) for panel in panels]),
-        rendered_depth=np.stack([millimetres(panel.rendered_depth) for panel in panels]),
-    )
+    images: dict[str, Any] = {
+        "index": np.array([panel.index for panel in panels]),
+        "rgb": np.stack([panel.rgb for panel in panels]),
+        "depth": np.stack([millimetres(panel.depth) for panel in panels]),
+        "rendered_rgb": np.stack(
+            [np.rint(np.clip(panel.rendered_rgb, 0, 1) * 255).astype(np.uint8) for panel in panels]
+        ),
+        "rendered_depth": np.stack([millimetres(panel.rendered_depth) for panel in panels]),
+    }
+    # (NumPy appends .npz to a name.)
+    with replacing(path) as partial, open(partial, "wb") as file:
+        np.savez_compressed(file, **images)
 
 
 def load_panels(path: Path) -> list[Panel]:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from warpslam.evaluation import AteResult, ReconstructionResult
     from warpslam.runs.folder import RunFolder
     from warpslam.runs.metrics import RunMetrics
+    from warpslam.sequences.base import Frame
 
 UNREADABLE = "unreadable"
 FINISHED, INTERRUPTED, FAILED = "finished", "interrupted", "failed"
@@ -249,7 +250,13 @@ class Progress:
     """ATE RMSE so far, aligned [m], asked anew with every twentieth more frames; None without ground truth."""
 
     fps: float
-    """Frames a second so far, set-up left out."""
+    """Frames a second, of the last frames."""
+
+    seconds_left: float = 0.0
+    """Until everything is written, as far as can be told [s]; 0 where nobody knows, with a live camera."""
+
+    frame: Frame | None = None
+    """What the method was given last."""
 
 
 @dataclass(frozen=True)

@@ -71,25 +71,30 @@ class ModuleProgress:
 Report = Callable[[ModuleProgress], None]
 
 
-def module_names(target: str) -> list[str]:
-    """Warp modules of a run on ``target`` "cpu" or "cuda", those that take longest to compile first; with rows in
-    blocks (`grid.layout`), `blocks_module` comes on top.
+def module_names(target: str, layout: str = "dense") -> list[str]:
+    """Warp modules of a run on ``target`` "cpu" or "cuda" with rows "dense" or in "blocks" (`grid.layout`), those that
+    take longest to compile first.
     """
-    return [f"warpslam.decoder_{target}", *(f"warpslam.{stage}" for stage in _STAGES)]
+    return [decoder_module(target, layout), *(f"warpslam.{stage}" for stage in _STAGES)]
 
 
-def blocks_module(target: str) -> str:
-    """Warp module of the decoders for rows in blocks."""
-    return f"warpslam.decoder_{target}_blocks"
+def decoder_module(target: str, layout: str) -> str:
+    """Warp module of the decoders for "cpu" or "cuda", and rows "dense" or in "blocks"; a run needs that of its layout
+    alone.
+    """
+    return f"warpslam.decoder_{target}" + ("" if layout == "dense" else f"_{layout}")
 
 
-def compile_kernels(device: wp.Device, report: Report | None = None, extra: Sequence[str] = ()) -> list[ModuleProgress]:
+def compile_kernels(
+    device: wp.Device, report: Report | None = None, extra: Sequence[str] = (), layout: str = "dense"
+) -> list[ModuleProgress]:
     """Load every module of a run for ``device``, compiling those that the kernel cache does not hold.
 
     Args:
         device: Device of the run.
         report: Called before and after each module; never by two threads at a time.
         extra: Names of more modules to load.
+        layout: Of the rows of grids, "dense" or "blocks".
 
     Returns:
         One entry a module, as they were finished.
@@ -100,7 +105,7 @@ def compile_kernels(device: wp.Device, report: Report | None = None, extra: Sequ
         # Not Module.load, whose default is the block size of CUDA: a CPU launch would compile everything once more.
         wp.force_load(device, [module], max_workers=0)
 
-    names = [*module_names(target), *extra]
+    names = [*module_names(target, layout), *extra]
     return _each(names, target, load, report, 1 if device.is_cuda else min(len(process_cores()), _WORKERS))
 
 

@@ -70,6 +70,9 @@ def named_device(name: str | None) -> wp.Device:
     """
     import warp as wp
 
+    from warpslam.runtime.quiet import start_warp
+
+    start_warp()
     known = [str(device) for device in wp.get_devices()]
     try:
         return wp.get_device(name)

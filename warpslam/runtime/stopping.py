@@ -1,4 +1,6 @@
-"""A request to stop that comes from outside: SIGTERM is what ctrl-C is, but for the exit code."""
+"""A request to stop that comes from outside: SIGTERM is what ctrl-C is, but for the exit code; and what may be finished
+all the same.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +16,22 @@ class Terminated(KeyboardInterrupt):
 
 
 _arrived = threading.Event()
+_is_due = threading.Event()  # as long as `terminable` lasts
 
 
 def was_terminated() -> bool:
     """Whether this process has been sent SIGTERM since `terminable` began."""
     return _arrived.is_set()
+
+
+def raise_if_terminated() -> None:
+    """Raise what a SIGTERM has raised already, but where nothing heeds it: many a library's import swallows it.
+
+    Raises:
+        Terminated: The signal has come, and the block of `terminable` goes on.
+    """
+    if _is_due.is_set():
+        raise Terminated
 
 
 @contextmanager
@@ -31,6 +44,7 @@ def terminable() -> Iterator[None]:
 
     def stop(number: int, frame: Any) -> None:
         _arrived.set()
+        _is_due.set()
         raise Terminated
 
     before = signal.signal(signal.SIGTERM, stop)
@@ -38,3 +52,43 @@ def terminable() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+        _is_due.clear()
+
+
+class Deferral:
+    """Keeps the first request to stop back, from `defer` on: what is being done then is short, and dear if it is lost.
+
+    The second one is as ever. A context, which gives the signals back to whom they belonged. Without effect outside the
+    main thread, and for signals that nobody handles.
+    """
+
+    def __init__(self) -> None:
+        self.has_come = False
+        """Whether one was kept back."""
+        self._before: dict[int, Any] = {}
+
+    def defer(self) -> None:
+        """From now on."""
+        if threading.current_thread() is not threading.main_thread() or self._before or self.has_come:
+            return
+        for number in (signal.SIGINT, signal.SIGTERM):
+            handler = signal.getsignal(number)
+            if callable(handler):
+                self._before[number] = handler
+                signal.signal(number, self._keep_back)
+
+    def _keep_back(self, number: int, frame: Any) -> None:
+        self.has_come = True
+        if number == signal.SIGTERM:
+            _arrived.set()
+        self._give_back()
+
+    def _give_back(self) -> None:
+        while self._before:
+            signal.signal(*self._before.popitem())
+
+    def __enter__(self) -> Deferral:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._give_back()

@@ -37,7 +37,7 @@ class BlockGrid(FeatureGrid):
         self._wanted = wp.zeros(1, dtype=int, device=device)
         self._count = wp.zeros(1, dtype=int, device=device)
         self._corners = wp.zeros(1, dtype=wp.vec3i, device=device)
-        super().__init__(level, spacing, std, seed, device, repeats=True)
+        super().__init__(level, spacing, std, seed, device)
         self._launcher = Launcher(device)
         self._reserve(BLOCK_ROWS)
         inputs = [seed, LEVELS.index(level), std, self.features]
@@ -116,10 +116,25 @@ class BlockGrid(FeatureGrid):
         self._reserve(start + BLOCK_ROWS * count)
         corners = wp.array((BLOCK * blocks).astype(np.int32), dtype=wp.vec3i, device=self.device)
         wp.copy(self._corners, corners, dest_offset=len(self.blocks))
-        self._launcher.launch(grid_kernels.fill_blocks, BLOCK_ROWS * count, [start, self.features, self.seen])
         self.blocks = np.concatenate([self.blocks, blocks])
+        self.renew(np.arange(start, start + BLOCK_ROWS * count))
         self._note(blocks, start)
         self._device_table.assign(self._table.ravel())
+
+    def rows_of(self, vertices: np.ndarray) -> np.ndarray:
+        """See `FeatureGrid.rows_of`."""
+        within = np.stack(np.meshgrid(*3 * [np.arange(BLOCK)], indexing="ij"), -1).reshape(-1, 3)
+        places = (BLOCK * self.blocks[:, None] + within - self.first).reshape(-1, 3)
+        mask = np.zeros(self.row_count, bool)
+        inside = ((places >= 0) & (places < self.shape)).all(axis=1)  # blocks reach beyond the box
+        mask[BLOCK_ROWS:][inside] = vertices.reshape(self.shape)[tuple(places[inside].T)]
+        return mask
+
+    def renew(self, rows: np.ndarray) -> None:
+        """See `FeatureGrid.renew`."""
+        which = wp.array(rows.astype(np.int32), dtype=int, device=self.device)
+        inputs = [which, self.lattice, self.seed, LEVELS.index(self.level), self.std, self.features, self.seen]
+        self._launcher.launch(grid_kernels.fill_rows, len(rows), inputs)
 
     def _note(self, blocks: np.ndarray, start: int) -> None:
         """Write first rows into the table."""

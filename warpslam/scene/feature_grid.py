@@ -40,12 +40,8 @@ class FeatureGrid:
         goes by (`RayBatch.drop_unseen`), and of the middle one, where `warpslam.mapping.depth_start` started it.
     """
 
-    def __init__(
-        self, level: str, spacing: float, std: float, seed: int, device: wp.Device, *, repeats: bool = False
-    ) -> None:
-        """``repeats``: Initial features are those of a `BlockGrid`, which repeat."""
+    def __init__(self, level: str, spacing: float, std: float, seed: int, device: wp.Device) -> None:
         self.level, self.spacing, self.std, self.seed, self.device = level, spacing, std, seed, device
-        self.repeats = repeats
         self.first = np.zeros(3, np.int64)
         self.shape: tuple[int, int, int] = (0, 0, 0)
         self.features = wp.zeros(1, dtype=Vec32, device=device)
@@ -71,6 +67,10 @@ class FeatureGrid:
     def bytes(self) -> int:
         """Memory of the features and of what leads to them."""
         return 128 * self.row_count
+
+    def rows_of(self, vertices: np.ndarray) -> np.ndarray:
+        """Mask of the rows, bool (rows,), of some vertices of the box, bool (vertices,); a shared row is nobody's."""
+        return vertices
 
     def cover(self, low: np.ndarray, high: np.ndarray) -> bool:
         """Grow to hold every vertex of the cells between ``low`` and ``high`` [m]; features stay. True if it grew."""
@@ -102,12 +102,22 @@ class FeatureGrid:
         wp.launch(
             grid_kernels.fill_grid,
             dim=shape,
-            inputs=[self.lattice, wp.vec3i(*first), self.seed, LEVELS.index(self.level), self.std, int(self.repeats)]
+            inputs=[self.lattice, wp.vec3i(*first), self.seed, LEVELS.index(self.level), self.std]
             + [old, old_seen, wp.vec3i(*shift)],
             outputs=[self.features, self.seen],
             device=self.device,
             record_tape=False,
         )
+
+    def renew(self, rows: np.ndarray) -> None:
+        """Some rows, int (n,), become again what a new vertex is; `seen` says so, too."""
+        fresh = FeatureGrid(self.level, self.spacing, self.std, self.seed, self.device)
+        fresh._resize(self.first, self.shape)
+        fresh.seen = self.seen
+        seen = self.seen.numpy().copy()
+        seen[rows] = 0
+        self.seen.assign(seen)
+        self.update_from(fresh, wp.array(rows.astype(np.int32), dtype=int, device=self.device))
 
     def state(self) -> GridState:
         """The grid as arrays; on the CPU they are its own, not copies."""

@@ -116,6 +116,16 @@ class ImagePool:
             self._rectifier.rectify(self._raw_current, motion, self.arrays)
         self.motion = motion
 
+    def show(self, image: int, motion: FrameMotion) -> None:
+        """A kept image into slot 0, rectified by how the camera moved."""
+        self.put_back(self.kept(image).unpack(self.camera), motion)
+
+    def put_back(self, current: _Image, motion: FrameMotion) -> None:
+        """Have slot 0 hold what `current` and `motion` were."""
+        self.motion = NO_MOTION
+        self._write(0, *current)
+        self.rectify_current(motion)
+
     def add(self, rgb: np.ndarray, depth: np.ndarray) -> int:
         """Keep an image for `bring`; returns its number."""
         self._kept.append(CompactImage.of(rgb, *_quantized(depth)))
@@ -225,9 +235,7 @@ class ImagePool:
         self, current: tuple[np.ndarray, np.ndarray, float], motion: FrameMotion, images: list[CompactImage]
     ) -> None:
         """Put back what `current`, `motion` and the kept images were."""
-        self.motion = NO_MOTION
-        self._write(0, *current)
-        self.rectify_current(motion)
+        self.put_back(current, motion)
         self._kept, self._slot_of = list(images), {}
 
     @property

@@ -172,6 +172,11 @@ class SceneMap:
         """Arrays of a row's size that a row takes, at most."""
         return 2 + self._buffers + slice_count(self.device)
 
+    @property
+    def layout(self) -> str:
+        """Of rows: "dense", or in "blocks", which `make_room` makes."""
+        return self.config.layout or "dense"
+
     @phase("growth")
     def make_room(
         self,

@@ -12,7 +12,7 @@ import warp as wp
 from warpslam.field.arrays import GridGradient, entries, lazy_zeros, struct
 from warpslam.kernels import touched_rows
 from warpslam.kernels.decoder.build import decoders_for
-from warpslam.kernels.touched_rows import RowState, Touched
+from warpslam.kernels.touched_rows import HELD, RowState, Touched
 from warpslam.runtime.cores import slice_count
 from warpslam.runtime.launching import Launcher, Step
 from warpslam.scene.feature_grid import FeatureGrid
@@ -45,6 +45,7 @@ class TouchedRows:
         self.launcher, self.device, self.capacity = launcher, launcher.device, capacity
         self._first, self._shape, self._lattice = grid.first.copy(), grid.shape, grid.lattice
         self._rejected = wp.zeros(1, dtype=int, device=self.device)
+        self._held: np.ndarray | None = None
         self._allocate(grid)
 
     def fit(self, grid: FeatureGrid) -> None:
@@ -82,8 +83,26 @@ class TouchedRows:
 
     def begin(self) -> None:
         """Start a call: no row has changed."""
-        self._changed.zero_()
+        if self._held is None:
+            self._changed.zero_()
+        else:
+            # Rows that are newer are held, too.
+            held = np.full(self._changed.shape[0], HELD.value, np.uint8)
+            held[: len(self._held)] = self._held
+            self._changed.assign(held)
         self._rejected.zero_()
+
+    def hold(self, held: np.ndarray | None) -> None:
+        """From the next call on, rows that are true stay what they are, bool (rows,); None for no more of that."""
+        self._held = None if held is None else np.where(held, np.uint8(HELD.value), np.uint8(0))
+
+    def forget(self, rows: np.ndarray) -> None:
+        """Some rows, int (n,), as if they had never been updated: their features begin anew."""
+        updates, moments = self.updates.numpy(), self.moments.numpy()
+        updates[rows], moments[rows] = 0, 0.0
+        if not self.device.is_cpu:  # there they are copies
+            self.updates.assign(updates)
+            self.moments.assign(moments)
 
     def wanted(self) -> GridGradient:
         """Where the kernels list the rows that this level's gradient touches, and put it."""
@@ -113,7 +132,7 @@ class TouchedRows:
 
     def changed_rows(self) -> wp.array:
         """Rows that have changed since `begin`, int (n,)."""
-        return wp.array(np.flatnonzero(self._changed.numpy()).astype(np.int32), dtype=int, device=self.device)
+        return wp.array(np.flatnonzero(self._changed.numpy() == 1).astype(np.int32), dtype=int, device=self.device)
 
     def state(self) -> TouchedRowsState:
         """What the next call depends on."""

@@ -171,6 +171,8 @@ def open_sequence(
 
 def _open(path: str | os.PathLike[str], dataset: str, camera: str | None, topics: str | None) -> RgbdSequence:
     path = _existing(path)
+    if not isinstance(dataset, str):
+        raise DatasetError(f"dataset = {dataset!r} must be the name of a format, or auto")
     name = dataset.strip().lower().replace("-", "_")
     name = _ALIASES.get(name, name)
     if name == "auto":

@@ -136,7 +136,7 @@ class _EdgePoints:
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         found = self.contrast[self.frame[inside], row[inside], column[inside]]
         # Edges that leave the image prove nothing, but a transform that throws most out has not won.
-        return float(found.sum()) / max(len(found), len(self.u) // 2)
+        return float(found.sum()) / max(len(found), len(self.u) // 2, 1)
 
 
 def _plane_fits(depth: np.ndarray, rays: np.ndarray) -> Iterator[tuple[float, float]]:

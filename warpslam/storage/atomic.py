@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from warpslam.reading import check_name
+
 PARTIAL = ".part"
 """Ending of a file that is being written."""
 
@@ -22,7 +24,11 @@ def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
         path: File to write.
         durable: The new content is on the disk before it has its name, so that even a power cut leaves the old file or
             the new one.
+
+    Raises:
+        OSError: ``path`` can't be the path of a file.
     """
+    check_name(path)
     partial = path.with_name(path.name + PARTIAL)
     try:
         yield partial

@@ -22,7 +22,7 @@ from safetensors.numpy import save_file
 
 from warpslam.errors import CheckpointError, ConfigError
 from warpslam.poses import are_rigid
-from warpslam.reading import check_regular
+from warpslam.reading import check_name, check_regular
 from warpslam.storage.atomic import replacing
 
 T = TypeVar("T")
@@ -57,6 +57,7 @@ def write_state(path: Path, form: StateFormat, header: dict[str, Any], arrays: d
     metadata = {"format": form.name, "version": form.version, "sha256": _NO_DIGEST, "header": header}
     native = {name: _native(array) for name, array in arrays.items()}
     try:
+        check_name(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path, durable=True) as partial:
             partial.touch()

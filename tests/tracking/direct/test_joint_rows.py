@@ -104,7 +104,7 @@ def test_features_put_keyframes_of_a_window_right():
         return None if found is None else pair_rows(found, T)
 
     members = [Pose(n + 1, n, pose) for n, pose in enumerate(poses)]
-    refined = refine_window(Blind(), members, 1, 2.0, 1.0, 3, between)
+    refined = refine_window(Blind(), members, 1, 2.0, 1.0, 3, between).poses
     apart = [motion_between(a, b) for a, b in zip(refined, truth, strict=True)]
     assert motion_between(poses[1], truth[1])[0] > 0.01
     assert max(step for step, _ in apart) < 4e-3 and max(turn for _, turn in apart) < 0.15

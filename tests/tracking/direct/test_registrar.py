@@ -245,7 +245,7 @@ def test_window_puts_keyframes_right(bench):
     noise = [np.zeros(6), 0.008 * rng.normal(size=6), np.zeros(6), 0.008 * rng.normal(size=6)]
     poses = [T @ motion_of(xi) for T, xi in zip(truth, noise, strict=True)]
     members = [Pose(n + 1, n, pose) for n, pose in enumerate(poses)]
-    refined = refine_window(bench.registrar, members, 1, 2.0, 1.0, 4)
+    refined = refine_window(bench.registrar, members, 1, 2.0, 1.0, 4).poses
     np.testing.assert_array_equal(refined[0], poses[0])
     before = max(motion_between(a, b)[0] for a, b in zip(poses, truth, strict=True))
     after = max(motion_between(a, b)[0] for a, b in zip(refined, truth, strict=True))

@@ -18,11 +18,6 @@ from warpslam.kernels.grid import Cell, Vec32, corner_weight, dot32, sum32
 from warpslam.kernels.samples import Rays, Span, sample_index, sample_point
 
 
-def decoder_module(target: str, layout: str) -> str:
-    """Warp module of the decoders for "cpu" or "cuda", and rows "dense" or in "blocks"."""
-    return f"warpslam.decoder_{target}" + ("" if layout == "dense" else f"_{layout}")
-
-
 class Build(SimpleNamespace):
     """What the kernels for one target are made of.
 
@@ -42,7 +37,7 @@ class Build(SimpleNamespace):
             size=size,
             on_cpu=target == "cpu",
             grid=dense if layout == "dense" else grid,
-            module=decoder_module(target, layout),
+            module=f"warpslam.decoder_{target}" + ("" if layout == "dense" else f"_{layout}"),
             Block=wp.types.matrix(shape=(size, 32), dtype=wp.float32),
             Positions=wp.types.matrix(shape=(size, 3), dtype=wp.float32),
             Scalars=wp.types.vector(length=size, dtype=wp.float32),

@@ -14,7 +14,7 @@ from warpslam.kernels.decoder.scatter import scatter_kernels
 
 def decoder_kernels(target: str, layout: str = "dense") -> SimpleNamespace:
     """Kernels of all decoders for ``target`` "cpu" or "cuda" and rows "dense" or in "blocks", in the Warp module
-    `decoder_module`.
+    ``warpslam.decoder_<target>`` or ``warpslam.decoder_<target>_blocks``.
 
     A launch over N samples has `thread_count(N)` threads and takes N as `Span.point_count`; one over a list of up to N
     samples has as many.
@@ -40,16 +40,11 @@ def decoder_kernels(target: str, layout: str = "dense") -> SimpleNamespace:
     )
 
 
-CPU = decoder_kernels("cpu")
-CUDA = decoder_kernels("cuda")
-_KERNELS = {
-    ("cpu", "dense"): CPU,
-    ("cuda", "dense"): CUDA,
-    ("cpu", "blocks"): decoder_kernels("cpu", "blocks"),
-    ("cuda", "blocks"): decoder_kernels("cuda", "blocks"),
+KERNELS = {
+    (target, layout): decoder_kernels(target, layout) for target in ("cpu", "cuda") for layout in ("dense", "blocks")
 }
 
 
 def decoders_for(device: wp.Device, layout: str = "dense") -> SimpleNamespace:
     """The decoder kernels built for this kind of device and layout; those that read no grid are alike in both."""
-    return _KERNELS["cuda" if device.is_cuda else "cpu", layout]
+    return KERNELS["cuda" if device.is_cuda else "cpu", layout]

@@ -13,8 +13,10 @@ from warpslam.tracking.features.witness import FeatureRows
 
 LEAST_INLIERS = 20
 """Features that must agree with a pose for their rows to count."""
-MOST_STEP, MOST_TURN = 0.1, 5.0
-"""Keyframes that features put further away from where they were believed to be [m], [degrees] are not told by them."""
+SAME_STEP, SAME_TURN = 0.1, 5.0
+"""Poses further apart [m], [degrees] are two places; neither the joint registration nor features must take a camera to
+another.
+"""
 FEATURE_WEIGHT = 5.0
 """Of a feature's row against one of the images. On rendered sequences, whose truth is known, squared errors of poses
 are 15 to 54 times what the images' normal matrix says, and 3 to 4 times what that of the features says.
@@ -45,14 +47,19 @@ def feature_rows(rows: FeatureRows, T_world_reference: np.ndarray, T_frame_refer
 
 
 def pair_rows(found: FoundPose, T_later_earlier: np.ndarray) -> PairRows | None:
-    """What two keyframes' features say of each other, who believed to be at T_later_earlier (4, 4); None where they see
-    another place: a period of the surface further, say.
+    """What features say of two keyframes believed to be at T_later_earlier (4, 4); None where they see another
+    place: a period of the surface further, say.
     """
     T = orthonormalized(found.T_camera_reference @ T_later_earlier)
-    step, turn = motion_between(T, T_later_earlier)
-    if step > MOST_STEP or turn > MOST_TURN:
+    if is_elsewhere(T, T_later_earlier):
         return None
     return PairRows(T, FEATURE_WEIGHT * found.H, FEATURE_WEIGHT * found.b)
+
+
+def is_elsewhere(a: np.ndarray, b: np.ndarray) -> bool:
+    """Whether two poses (4, 4) are two places."""
+    step, turn = motion_between(a, b)
+    return bool(step > SAME_STEP or turn > SAME_TURN)
 
 
 def is_far(a: np.ndarray, b: np.ndarray) -> bool:

@@ -128,5 +128,8 @@ class SecondWitness:
             keyframe = self.keyframes[number]
             if self._known.get(number) != keyframe.motion:
                 picture = Picture.of(*self.images.kept(keyframe.image).unpack(self.camera))
-                self._witness.add_keyframe(number, self._features(replace(picture, motion=keyframe.motion)))
+                # On the CPU they are those of the frame, which may have been asked already.
+                index = keyframe.index if self._witness.device.is_cpu else -1
+                picture = replace(picture, index=index, motion=keyframe.motion)
+                self._witness.add_keyframe(number, self._features(picture))
                 self._known[number] = keyframe.motion

@@ -113,6 +113,11 @@ class TimingEstimator:
         self._stage = 0
         self.is_done = False
 
+    @property
+    def is_open(self) -> bool:
+        """Whether depth has stamps of its own, and what is known of the timing may yet change."""
+        return self._stamped and not self.is_done
+
     def look(self, tracker: DirectTracker, history: FrameHistory, depth_offset: float) -> FoundTiming | None:
         """Take in the frame before the last; what was found out by now, if that is news.
 

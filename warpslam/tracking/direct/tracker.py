@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
@@ -29,8 +29,10 @@ from warpslam.scene.keyframes import Keyframe
 from warpslam.tracking.direct.aliases import difference_elsewhere
 from warpslam.tracking.direct.joint_rows import (
     LINEARIZATIONS,
+    SAME_STEP,
     WEAK_SIGMA,
     feature_rows,
+    is_elsewhere,
     is_far,
     pair_rows,
     weakest_sigma,
@@ -54,8 +56,6 @@ NEAR_KEYFRAMES = MOST_NEAR
 """Keyframes, the nearest by pose, whose overlap is looked at."""
 DEGREE = 0.02
 """Metres that a degree counts for when keyframes are ordered by nearness."""
-SAME_STEP, SAME_TURN = 0.1, 5.0
-"""Poses further apart [m], [degrees] are two places; the joint registration must not take a frame to another."""
 BRIDGE = 5
 """Frames without a pose over which constant speed is still believed."""
 MAX_GAP = 10
@@ -100,6 +100,10 @@ LEAST_COST = 0.5
 """A registration that costs less needs no comparison with others."""
 SEARCH_WIDE, SEARCH_DEEP = 6, 3
 """Starts refined at the middle level, and of these at the largest."""
+UNTOLD = np.diag([1e-4] * 3 + [1e-4] * 3)
+"""Covariance (6, 6) of a frame against its keyframe where it was not kept: 1 cm, half a degree."""
+GIVEN = np.zeros((6, 6))
+"""Covariance of poses that are given."""
 SCRATCH = 0
 """Row of points that hold no keyframe's."""
 
@@ -228,6 +232,24 @@ class DirectState:
         return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
 
 
+class Hooks(Protocol):
+    """What closing of loops hears of tracking, and tells it."""
+
+    def link(self, i: int, j: int, T_i_j: np.ndarray, covariance: np.ndarray) -> None:
+        """Two keyframes were registered to each other: T_i_j (4, 4), uncertain by exp(e) on its right, e = (v, w);
+        covariance (6, 6).
+        """
+
+    def refined(self, window: Sequence[int]) -> None:
+        """Keyframes were refined together, and `link` was told of their pairs."""
+
+    def serves_again(self, old: int, reference: int) -> bool:
+        """Whether a keyframe that is seen again may become the reference after another, or a new one is wanted."""
+
+    def places(self, picture: Picture) -> list[int]:
+        """Keyframes that a frame of which nothing is known may be at, the likeliest first."""
+
+
 class DirectTracker:
     """Finds the pose of the frame in slot 0 of the image pool, and makes keyframes.
 
@@ -272,18 +294,26 @@ class DirectTracker:
         self._rivals: list[Attempt] = []
         self._rotations = rotation_grid(config.search_span)
         self._second = SecondWitness(camera, device, max_depth, keyframes, images)
+        self.is_timing_open = False
+        """Whether the camera's timing is being estimated: depth of features, at a wrong time, would disturb that."""
         self.fixed = 0
         """Keyframes, the first ones, whose poses stay as they are: those of a map that is only looked at."""
         self.counts = {"sure": 0, "searched": 0}
+        self.hooks: Hooks | None = None
 
     # -- what Slam asks ------------------------------------------------------------------------------------------
 
-    def place(self, frame: AdmittedFrame, pose: np.ndarray) -> None:
-        """A frame whose pose is given; it becomes a keyframe."""
+    def place(self, frame: AdmittedFrame, pose: np.ndarray, *, is_apart: bool = False) -> None:
+        """A frame whose pose is given; it becomes a keyframe. ``is_apart``: it says nothing of how the frame lies to
+        others.
+        """
         self._build_missing()
         self._load(frame)
         self._set_motion(frame.index, FrameMotion(depth_offset=frame.depth_offset, readout=self.readout))
         self._add_keyframe(frame.index, pose, self.images.keep_current())
+        if self._reference > 0 and not is_apart:
+            before = self._reference - 1
+            self._link(before, self._reference, inverse(self.keyframes[before].pose) @ pose, GIVEN)
         self._note(frame)
 
     def locate(self, frame: AdmittedFrame, history: FrameHistory, field: FieldArrays | None = None) -> Located:
@@ -356,6 +386,7 @@ class DirectTracker:
                 self._reference = old
             else:
                 self._add_keyframe(frame.index, pose, self.images.keep_current())
+                self._link(attempt.keyframe, self._reference, anchor.T_keyframe_frame, done.whole_covariance)
                 self._refine(history)
                 pose = self.keyframes[-1].pose.copy()
         return self._located(pose, done, history)
@@ -432,7 +463,7 @@ class DirectTracker:
         """Whether the frame may be at another place as well."""
         for other in self._rivals:
             is_alike = other.measures.agreement > FOUND_AGREEMENT and other.cost < UNIQUE * attempt.cost
-            if is_alike and _is_elsewhere(pose, self._pose_of(other)):
+            if is_alike and is_elsewhere(pose, self._pose_of(other)):
                 return True
         return self._is_untold(row, pose)
 
@@ -440,8 +471,7 @@ class DirectTracker:
         """Whether a frame does not tell where it is, and did not go on as it did, no period of the surface further."""
         if self._foretold is not None and motion_between(self._foretold, pose)[0] < SAME_STEP:
             return False
-        weights = self.config.grey_weight, self.config.depth_weight
-        return difference_elsewhere(self.registrar, row, SCRATCH, weights, SAME_STEP) < TELLING
+        return self.difference_elsewhere(row) < TELLING
 
     # -- registration --------------------------------------------------------------------------------------------
 
@@ -503,7 +533,7 @@ class DirectTracker:
                 attempt, cost=best.cost, measures=best.measures, grey_scale=best.grey_scale, moved=best.moved
             )
         T, T_joint, back = np.asarray(result["T"], np.float64), np.asarray(last["T"], np.float64), found.back
-        if _is_elsewhere(T_joint, T):
+        if is_elsewhere(T_joint, T):
             pair = self._pair_back(reference)
             T_joint, pair["T"] = T, inverse(T)
             back = self.registrar.pairs(self.plan.middle, pair, self.config.grey_weight, self.config.depth_weight)[0]
@@ -829,7 +859,9 @@ class DirectTracker:
         scores = self.registrar.rotations(np.array([self._smallest[k] for k in numbers]), row, self._rotations)
         found: list[Attempt] = []
         order = np.argsort(scores.min(axis=1), kind="stable")
-        witness = self._second.relocalize(picture, [numbers[n] for n in order[:WITNESS_KEYFRAMES]])
+        places = [] if self.hooks is None else self.hooks.places(picture)
+        places = list(dict.fromkeys([*places, *(numbers[n] for n in order[:WITNESS_KEYFRAMES])]))
+        witness = self._second.relocalize(picture, places)
         if witness is not None:
             near = self._nearest(witness.T_world_camera)
             overlap = self._overlaps_at(row, witness.T_world_camera)
@@ -849,8 +881,8 @@ class DirectTracker:
             return best
         place = self._pose_of(best)
         for other in found:
-            is_elsewhere = _is_elsewhere(place, self._pose_of(other))
-            if is_elsewhere and self._is_good(other) and other.cost < UNIQUE * best.cost:
+            is_rival = is_elsewhere(place, self._pose_of(other))
+            if is_rival and self._is_good(other) and other.cost < UNIQUE * best.cost:
                 return replace(best, ok=False)
         return best
 
@@ -871,6 +903,8 @@ class DirectTracker:
         config = self.config
         best = max(self._overlap.items(), key=lambda item: item[1], default=None)
         if best is None or best[1] <= config.keyframe_overlap or best[0] == reference:
+            return None
+        if self.hooks is not None and not self.hooks.serves_again(best[0], reference):
             return None
         step, turn = motion_between(self.keyframes[best[0]].pose, pose)
         far = 0.8 * config.keyframe_step * self.registrar.mean_depth(row)
@@ -904,7 +938,10 @@ class DirectTracker:
         if before is None or self._row_before() is None or self._has_kept_before:
             return
         image = self.images.add(before.rgb, before.depth) if before.kept is None else self.images.add_kept(*before.kept)
+        anchor = self._anchors[before.index]
         self._add_keyframe(before.index, history.pose(before.index), image)
+        if anchor is not None:
+            self._link(anchor.keyframe, self._reference, anchor.T_keyframe_frame, UNTOLD)
 
     @property
     def _has_kept_before(self) -> bool:
@@ -933,23 +970,24 @@ class DirectTracker:
             Pose(self._points_of(k), self._row(self.keyframes[k]), self.keyframes[k].pose, k < self.fixed)
             for k in active
         ]
-        poses = refine_window(
+        refined = refine_window(
             self.registrar,
             members,
             self.judged,
             self.config.grey_weight,
             self.config.depth_weight,
             self.config.window_iterations,
-            self._features_between(active) if self.config.window_features else None,
+            self._features_between(active) if self.config.window_features and not self.is_timing_open else None,
         )
-        moved = set()
-        for k, pose in zip(active, poses, strict=True):
-            if not np.array_equal(pose, self.keyframes[k].pose):
-                self.keyframes[k].pose = pose
-                moved.add(k)
-        for index, anchor in enumerate(self._anchors):
-            if anchor is not None and anchor.keyframe in moved and index < len(history):
-                history.correct(index, self.keyframes[anchor.keyframe].pose @ anchor.T_keyframe_frame)
+        self.move_keyframes(dict(zip(active, refined.poses, strict=True)), history)
+        for (i, j), H in refined.information.items():
+            self._link(active[i], active[j], inverse(refined.poses[i]) @ refined.poses[j], covariance_of(H))
+        if self.hooks is not None:
+            self.hooks.refined(active)
+
+    def _link(self, i: int, j: int, T_i_j: np.ndarray, covariance: np.ndarray) -> None:
+        if self.hooks is not None:
+            self.hooks.link(i, j, T_i_j, covariance)
 
     def _features_between(self, members: Sequence[int]) -> Callable[[int, int, np.ndarray], PairRows | None]:
         """Rows of the features that two of some keyframes have in common."""
@@ -986,6 +1024,35 @@ class DirectTracker:
     def overlap(self) -> dict[int, float]:
         """Share of the points of a keyframe that the last frame sees, by keyframe."""
         return self._overlap
+
+    def move_keyframes(self, poses: Mapping[int, np.ndarray], history: FrameHistory) -> None:
+        """Keyframes go to other poses (4, 4), and the frames that hang on them with them."""
+        moved = {k for k, pose in poses.items() if not np.array_equal(pose, self.keyframes[k].pose)}
+        for k in moved:
+            self.keyframes[k].pose = poses[k]
+        for index, anchor in enumerate(self._anchors):
+            if anchor is not None and anchor.keyframe in moved and index < len(history):
+                history.correct(index, self.keyframes[anchor.keyframe].pose @ anchor.T_keyframe_frame)
+
+    def keyframe_row(self, number: int) -> int:
+        """Row of a keyframe's images, built if they are gone; it holds until `CACHED` others were asked for."""
+        return self._row(self.keyframes[number])
+
+    def difference_elsewhere(self, row: int) -> float:
+        """How much images differ from themselves at another place, see `aliases.difference_elsewhere`; below `TELLING`
+        they do not tell where they are.
+        """
+        weights = self.config.grey_weight, self.config.depth_weight
+        return difference_elsewhere(self.registrar, row, SCRATCH, weights, SAME_STEP)
+
+    @property
+    def is_confirming(self) -> bool:
+        """Whether a place was found that is not believed yet."""
+        return self._found is not None
+
+    def mean_depth(self, number: int) -> float:
+        """Of what a keyframe sees [m]."""
+        return self._mean_depth[number]
 
     def row_of(self, index: int) -> int | None:
         """Where the images of a frame are; None if they are gone."""
@@ -1211,12 +1278,6 @@ def _better(a: Attempt | None, b: Attempt | None, *, by_cost: bool = False) -> A
     if by_cost:
         return b if b.cost < a.cost else a
     return b if b.measures.worth > a.measures.worth else a
-
-
-def _is_elsewhere(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two poses are two places."""
-    step, turn = motion_between(a, b)
-    return bool(step > SAME_STEP or turn > SAME_TURN)
 
 
 def _running(mean: float, value: float) -> float:

@@ -38,6 +38,16 @@ class Pose:
 
 
 @dataclass(frozen=True)
+class Refined:
+    """What a refinement comes to."""
+
+    poses: list[np.ndarray]
+    """Of the members, (4, 4)."""
+    information: dict[tuple[int, int], np.ndarray]
+    """Of each pair (i, j), i < j, that was registered: of W_i^-1 W_j exp(e), e = (v, w); float64 (6, 6)."""
+
+
+@dataclass(frozen=True)
 class PairRows:
     """What a pair has in common beside its images, linearised once."""
 
@@ -61,30 +71,31 @@ def refine_window(
     depth: float,
     iterations: int,
     more: Callable[[int, int, np.ndarray], PairRows | None] | None = None,
-) -> list[np.ndarray]:
-    """Poses (4, 4) of the members after refinement; the first, and those that are fixed, stay where they are.
+) -> Refined:
+    """Refine the poses of the members; the first, and those that are fixed, stay where they are.
 
     more: Rows of the points of member i in the later member j, at T_j_i (4, 4); None where there are none.
     """
     poses = [member.T_world_camera.copy() for member in members]
+    information: dict[tuple[int, int], np.ndarray] = {}
     pairs = _overlapping(registrar, members)
     if not pairs:
-        return poses
+        return Refined(poses, information)
     asked = records(registration.Pair, len(pairs))
     asked["exposure"] = (1.0, 0.0)
     asked["keyframe"], asked["row"] = zip(*((members[i].points, members[j].row) for i, j in pairs), strict=True)
     count = len(members)
     added: dict[tuple[int, int], PairRows] = {}
-    if more is not None:
-        for i, j in ((i, j) for i, j in pairs if i < j):
-            rows = more(i, j, inverse(poses[j]) @ poses[i])
-            if rows is not None:
-                added[i, j] = rows
+    for i, j in pairs:
+        rows = more(i, j, inverse(poses[j]) @ poses[i]) if more is not None and i < j else None
+        if rows is not None:
+            added[i, j] = rows
     for _ in range(iterations):
         transforms = [inverse(poses[j]) @ poses[i] for i, j in pairs]
         asked["T"] = transforms
         sums = registrar.pairs(level, asked, grey, depth)
         A, b = np.zeros((count, 6, count, 6)), np.zeros((count, 6))
+        information.clear()
         for (i, j), T, pair, found in zip(pairs, transforms, asked, sums, strict=True):
             H, g = np.asarray(found["H"], np.float64), np.asarray(found["g"], np.float64)
             H, g = np.where(np.isfinite(H), H, 0.0), np.where(np.isfinite(g), g, 0.0)
@@ -106,6 +117,9 @@ def refine_window(
             A[j, :, i] -= h @ Ad
             b[i] += Ad.T @ q
             b[j] -= q
+            # T exp(-xi) = exp(-Ad(T) xi) T: both ways of a pair speak of its second member's axes.
+            known = h if i < j else Ad.T @ h @ Ad
+            information[min(i, j), max(i, j)] = information.get((min(i, j), max(i, j)), 0.0) + known
         M = A.reshape(6 * count, 6 * count)
         M[np.diag_indices_from(M)] = 1.001 * M.diagonal() + 1.0
         fixed = [n for n, member in enumerate(members) if n == 0 or member.is_fixed]
@@ -114,7 +128,7 @@ def refine_window(
         steps = -np.linalg.solve(M, b.reshape(-1)).reshape(count, 6)
         for k in (k for k in range(count) if k not in fixed):
             poses[k] = orthonormalized(poses[k] @ motion_of(np.clip(steps[k], -MAX_STEP, MAX_STEP)))
-    return poses
+    return Refined(poses, information)
 
 
 def _overlapping(registrar: Registrar, members: Sequence[Pose]) -> list[tuple[int, int]]:
