@@ -36,7 +36,7 @@ SMALL = ["warpslam.views"]
 @pytest.fixture
 def empty_cache(monkeypatch, tmp_path):
     """A kernel cache that holds nothing, and a run that needs one small module; afterwards all is as it was."""
-    monkeypatch.setattr(compilation, "module_names", lambda target, layout="dense": SMALL)
+    monkeypatch.setattr(compilation, "module_names", lambda target, layouts=(): SMALL)
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "cache"))
     find_module(SMALL[0]).unload()
     yield tmp_path / "cache"
@@ -49,7 +49,7 @@ def test_nothing_is_loaded_after_the_start(monkeypatch, optimizer, loss):
     monkeypatch.setattr(recorder, "matrix_peak_gflops", lambda: 1.0)
     room = SyntheticSequence(1, 8, intrinsics=new_slam().intrinsics)
     config = Config.from_preset("default", [f"mapping.loss={loss}"])
-    for name in [*module_names("cpu"), decoder_module("cpu", "blocks"), *room.warp_modules]:
+    for name in [*module_names("cpu"), *room.warp_modules]:
         find_module(name).unload()
     pipeline.load_kernels(room, "cpu", config=config)
     with warpslam.profile() as profile:
@@ -83,7 +83,7 @@ def test_modules_load_side_by_side(monkeypatch):
     monkeypatch.setattr(compilation, "process_cores", lambda: [0, 1])
     together = threading.Barrier(2, timeout=20)
     names, seen, inside = ["warpslam.kernels.losses", "warpslam.kernels.adam"], [], []
-    monkeypatch.setattr(compilation, "module_names", lambda target, layout: names)
+    monkeypatch.setattr(compilation, "module_names", lambda target, layouts: names)
     monkeypatch.setattr(wp, "force_load", lambda *args, **kwargs: together.wait())
 
     def report(progress: ModuleProgress) -> None:

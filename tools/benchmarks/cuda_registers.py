@@ -19,7 +19,7 @@ from pathlib import Path
 import warp as wp
 
 from warpslam.cli.common import quiet_warp
-from warpslam.runtime.compilation import decoder_module, find_module, module_names
+from warpslam.runtime.compilation import find_module, module_names
 
 _SECTION = struct.Struct("<IIQQQQIIQQ")
 _SYMBOL = struct.Struct("<IBBHQQ")
@@ -166,7 +166,7 @@ def main() -> None:
     parser.add_argument("--arch", type=int, nargs="+", default=[80, 90], help="compute capabilities (80 90)")
     parser.add_argument("--module", action="append", help="only this Warp module; may be repeated")
     options = parser.parse_args()
-    names = options.module or [*module_names("cuda"), decoder_module("cuda", "blocks")]
+    names = options.module or module_names("cuda")
     print(markdown_table({a: {name: read_cubin(compiled_cubin(name, a)) for name in names} for a in options.arch}))
 
 

@@ -138,13 +138,13 @@ print("RESULT", json.dumps({"seconds": time.perf_counter() - t1, "import_seconds
 
 def compile_(device: str) -> Figures:
     """Each module in a process of its own, so that compiling uses all cores."""
-    from warpslam.runtime.compilation import decoder_module, module_names
+    from warpslam.runtime.compilation import module_names
     from warpslam.synthetic import RenderedSequence
 
     _bring_cache()
     target = "cpu" if device == "cpu" else "cuda"
     baseline = (f"warpslam.imap_{target}", "warpslam.kernels.imap_density")
-    names = [*module_names(target), decoder_module(target, "blocks"), *RenderedSequence.warp_modules, *baseline]
+    names = [*module_names(target), *RenderedSequence.warp_modules, *baseline]
 
     def one(name: str) -> Figures:
         done = subprocess.run([sys.executable, "-c", _LOAD, name, device], capture_output=True, text=True)

@@ -380,10 +380,10 @@ def pytest_terminal_summary(terminalreporter: Any, config: Any) -> None:
 
 def main() -> int:
     """Translate every kernel of a run on CUDA; 1 if one can't be."""
-    from warpslam.runtime.compilation import decoder_module, module_names
+    from warpslam.runtime.compilation import module_names
 
     runner, failures = Runner(), 0
-    for name in [*module_names("cuda"), decoder_module("cuda", "blocks")]:
+    for name in module_names("cuda"):
         module = runner.module(name)
         for function in module.functions.values():
             if function.is_entry:

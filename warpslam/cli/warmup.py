@@ -11,7 +11,7 @@ import warp as wp
 
 from warpslam.cli.common import add_command, quiet_warp
 from warpslam.pipeline.setup import check_device
-from warpslam.runtime.compilation import ModuleProgress, compile_for_architecture, compile_kernels, decoder_module
+from warpslam.runtime.compilation import ModuleProgress, compile_for_architecture, compile_kernels
 from warpslam.synthetic import RenderedSequence
 
 _EXPLANATION = """
@@ -40,12 +40,10 @@ def _warmup(options: argparse.Namespace) -> int:
     extra = RenderedSequence.warp_modules
     architecture = re.fullmatch(r"sm_?(\d+)", options.device or "")
     if architecture:
-        modules = compile_for_architecture(int(architecture[1]), _print, (decoder_module("cuda", "blocks"), *extra))
+        modules = compile_for_architecture(int(architecture[1]), _print, extra)
     else:
         check_device(options.device)
-        device = wp.get_device(options.device)
-        blocks = decoder_module("cuda" if device.is_cuda else "cpu", "blocks")
-        modules = compile_kernels(device, _print, (blocks, *extra))
+        modules = compile_kernels(wp.get_device(options.device), _print, extra)
     compiled = sum(module.compiled for module in modules)
     print(f"{compiled} of {len(modules)} modules compiled in {time.perf_counter() - start:.1f} s")
     print(f"kernel cache {wp.config.kernel_cache_dir}")

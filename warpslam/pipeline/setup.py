@@ -147,7 +147,7 @@ def load_kernels(
     """
     check_device(device)
     layout = (config or Config()).resolved().grid.layout or "dense"
-    return compile_kernels(wp.get_device(device), report, getattr(sequence, "warp_modules", ()), layout)
+    return compile_kernels(wp.get_device(device), report, getattr(sequence, "warp_modules", ()), [layout])
 
 
 def build_slam(

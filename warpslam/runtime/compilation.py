@@ -68,14 +68,17 @@ class ModuleProgress:
     seconds: float | None = None
 
 
+LAYOUTS = ("dense", "blocks")
+"""How the rows of grids may be laid out, `grid.layout`; each has decoders of its own."""
+
 Report = Callable[[ModuleProgress], None]
 
 
-def module_names(target: str, layout: str = "dense") -> list[str]:
-    """Warp modules of a run on ``target`` "cpu" or "cuda" with rows "dense" or in "blocks" (`grid.layout`), those that
-    take longest to compile first.
+def module_names(target: str, layouts: Sequence[str] = LAYOUTS) -> list[str]:
+    """Warp modules of runs on ``target`` "cpu" or "cuda" by the layout of their grids, those that take longest to
+    compile first.
     """
-    return [decoder_module(target, layout), *(f"warpslam.{stage}" for stage in _STAGES)]
+    return [*(decoder_module(target, layout) for layout in layouts), *(f"warpslam.{stage}" for stage in _STAGES)]
 
 
 def decoder_module(target: str, layout: str) -> str:
@@ -86,7 +89,7 @@ def decoder_module(target: str, layout: str) -> str:
 
 
 def compile_kernels(
-    device: wp.Device, report: Report | None = None, extra: Sequence[str] = (), layout: str = "dense"
+    device: wp.Device, report: Report | None = None, extra: Sequence[str] = (), layouts: Sequence[str] = LAYOUTS
 ) -> list[ModuleProgress]:
     """Load every module of a run for ``device``, compiling those that the kernel cache does not hold.
 
@@ -94,7 +97,7 @@ def compile_kernels(
         device: Device of the run.
         report: Called before and after each module; never by two threads at a time.
         extra: Names of more modules to load.
-        layout: Of the rows of grids, "dense" or "blocks".
+        layouts: Of grids: a run has one.
 
     Returns:
         One entry a module, as they were finished.
@@ -105,7 +108,7 @@ def compile_kernels(
         # Not Module.load, whose default is the block size of CUDA: a CPU launch would compile everything once more.
         wp.force_load(device, [module], max_workers=0)
 
-    names = [*module_names(target, layout), *extra]
+    names = [*module_names(target, layouts), *extra]
     return _each(names, target, load, report, 1 if device.is_cuda else min(len(process_cores()), _WORKERS))
 
 
