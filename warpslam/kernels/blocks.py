@@ -11,7 +11,7 @@ from warpslam.kernels.frustum import MODULE
 from warpslam.kernels.grid import BLOCK, Lattice
 from warpslam.kernels.pixels import Camera, Images, measured
 
-TILE = 8
+TILE = 16
 """Width and height of a tile [px]."""
 
 MAX_PIECES = wp.constant(1 << 12)
