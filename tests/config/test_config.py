@@ -94,17 +94,6 @@ def test_given_poses_decide_what_was_left_open():
             assert config.tracking.use_given_poses or set(changed) == followed
 
 
-def test_the_loss_decides_the_layout_that_was_left_open():
-    """Rows in blocks by the direct loss, for the whole box by the rendering loss and so by all of the paper's."""
-    for name in PRESETS:
-        for loss in ("direct", "rendering"):
-            grid = Config.from_preset(name, [f"mapping.loss={loss}"]).resolved().grid
-            assert grid.layout == {"direct": "blocks", "rendering": "dense"}[loss]
-            said = Config.from_preset(name, [f"mapping.loss={loss}", "grid.layout=dense"]).resolved()
-            assert said.grid.layout == "dense"
-        assert not name.startswith("paper") or Config.from_preset(name).resolved().grid.layout == "dense"
-
-
 def test_what_followed_from_given_poses_ends_with_them():
     """A map that was made with given poses, and is tracked in: bundle adjustment is back, unless it was said not to."""
     given = Config.from_preset("default", ["tracking.use_given_poses=true"]).resolved()

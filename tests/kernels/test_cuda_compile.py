@@ -21,6 +21,7 @@ ARCHITECTURES = (80, 90)
 SPILLING = {
     "color_backward": (16, "holds the gradients of two layers for the weights of the embedding"),
     "fine_forward": (52, "on sm_80 alone, where 16 bytes of weights at a time lie beside the values of two levels"),
+    "warpslam.decoder_cuda_blocks fine_forward": (228, "the same beside the tables of blocks"),
     "register": (1540, "holds a whole registration between two evaluations of its equations"),
     "register_jointly": (2580, "the same, for four keyframes"),
     "layer_weights": (1200, "of the baseline: sums eight rows of 32 at once"),
@@ -85,7 +86,7 @@ def test_no_kernel_spills_but_the_known_ones(architecture):
     """Registers go to local memory only in kernels that are listed with a reason, and no more than they did."""
     for name in kernel_modules():
         for kernel in resources(name, architecture).values():
-            allowed, _ = SPILLING.get(kernel.kernel, (0, ""))
+            allowed, _ = SPILLING.get(f"{name} {kernel.kernel}") or SPILLING.get(kernel.kernel, (0, ""))
             spilled = kernel.spill_stores + kernel.spill_loads
             assert spilled <= allowed, f"{kernel.kernel} on sm_{architecture} spills {spilled} bytes"
 

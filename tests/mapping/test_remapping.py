@@ -25,7 +25,7 @@ SETTINGS = [
 ]  # fmt: skip
 RENDERING = ["mapping.loss=rendering", "mapping.coarse=false", "mapping.iterations=6", "mapping.first_iterations=20"]
 
-DENSE = ["grid.layout=dense"]
+BLOCKS = ["grid.layout=blocks"]
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_what_moved_is_where_it_is_now(frames, path):
     assert np.median(after) < 2.0 * np.median(right)
 
 
-@pytest.mark.parametrize("overrides", [[], RENDERING, DENSE], ids=["direct", "rendering", "dense"])
+@pytest.mark.parametrize("overrides", [[], RENDERING, BLOCKS], ids=["direct", "rendering", "blocks"])
 def test_the_rest_stays_to_the_byte(frames, path, overrides):
     """Vertices that no moved view reaches, the coarse level, the colour decoder, the current image; two runs agree."""
     both = []
@@ -156,17 +156,16 @@ def test_blocks_are_mapped_again_as_dense_rows_are(frames, path):
     np.testing.assert_array_equal(both[0].visual.vertex_colors, both[1].visual.vertex_colors)
 
 
-def test_beside_tracking_both_maps_are_the_same(frames, path):
+@pytest.mark.parametrize("layout", ["dense", "blocks"])
+def test_beside_tracking_both_maps_are_the_same(frames, path, layout):
     """With the overlapped schedule the tracker's map gets all rows that were begun again."""
-    slam = mapped(frames, wrong(path), "schedule=overlapped")
+    slam = mapped(frames, wrong(path), "schedule=overlapped", f"grid.layout={layout}")
     map_again(slam, path)
     assert slam.mapper.scene is not slam.scene
     for level, grid in slam.mapper.scene.grids.items():
-        for mine, theirs in (
-            (grid.features, slam.scene.grids[level].features),
-            (grid.seen, slam.scene.grids[level].seen),
-        ):
-            np.testing.assert_array_equal(mine.numpy(), theirs.numpy(), level)
+        mine, theirs = grid.state(), slam.scene.grids[level].state()
+        np.testing.assert_array_equal(mine.features, theirs.features, level)
+        np.testing.assert_array_equal(mine.seen, theirs.seen, level)
     assert np.median(surface_errors(slam, frames, path, range(FIRST_MOVED + 1, COUNT - 1))) < 0.1
 
 

@@ -43,17 +43,17 @@ def empty_cache(monkeypatch, tmp_path):
     find_module(SMALL[0]).unload()
 
 
-@pytest.mark.parametrize(("optimizer", "loss"), [("adam", "rendering"), ("direct", "rendering"), ("direct", "direct")])
-def test_nothing_is_loaded_after_the_start(monkeypatch, optimizer, loss):
+@pytest.mark.parametrize(("optimizer", "layout"), [("adam", "dense"), ("direct", "dense"), ("direct", "blocks")])
+def test_nothing_is_loaded_after_the_start(monkeypatch, optimizer, layout):
     """A run down to its mesh launches kernels only from modules, and block sizes, that were loaded beforehand."""
     monkeypatch.setattr(recorder, "matrix_peak_gflops", lambda: 1.0)
     room = SyntheticSequence(1, 8, intrinsics=new_slam().intrinsics)
-    config = Config.from_preset("default", [f"mapping.loss={loss}"])
+    config = Config.from_preset("default", [f"grid.layout={layout}"])
     for name in [*module_names("cpu"), *room.warp_modules]:
         find_module(name).unload()
     pipeline.load_kernels(room, "cpu", config=config)
     with warpslam.profile() as profile:
-        settings = [f"tracking.optimizer={optimizer}", f"mapping.loss={loss}", "mapping.first_iterations=12"]
+        settings = [f"tracking.optimizer={optimizer}", f"grid.layout={layout}", "mapping.first_iterations=12"]
         slam = new_slam(*settings, "direct.sure_correlation=1")  # features are asked, too
         for n in range(3):
             slam.step(room[n].rgb, room[n].depth, T_world_camera=room[n].T_world_camera)
@@ -61,7 +61,7 @@ def test_nothing_is_loaded_after_the_start(monkeypatch, optimizer, loss):
     assert slam.keyframes and profile.launches
     assert optimizer != "direct" or slam.direct.counts["searched"] == 2
     assert [module.module for module in profile.report.modules] == []
-    other = decoder_module("cpu", "dense" if loss == "direct" else "blocks")
+    other = decoder_module("cpu", "dense" if layout == "blocks" else "blocks")
     assert not find_module(other).execs, "a run needs the decoders of one layout"
 
 

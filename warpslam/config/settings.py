@@ -38,11 +38,10 @@ class GridConfig(_Group):
     middle_std: float = Field(0.01, ge=0, description="standard deviation of the initial middle features")
     fine_std: float = Field(0.0001, ge=0, description="standard deviation of the initial fine features")
     color_std: float = Field(0.01, ge=0, description="standard deviation of the initial colour features")
-    layout: Literal["dense", "blocks"] | None = Field(
-        None,
+    layout: Literal["dense", "blocks"] = Field(
+        "dense",
         description="rows of the middle, fine and colour level: one for every vertex of the map's box; or in blocks of "
-        "4 x 4 x 4 vertices where something was seen, so that memory follows that; empty: blocks with the direct loss, "
-        "whose results are the same to the bit, dense with the rendering loss",
+        "4 x 4 x 4 vertices where something was seen, so that memory follows that; same results with the direct loss",
     )
     margin: float = Field(0.6, gt=0, description="the map reaches this far beyond what was seen [m]")
     max_depth: float = Field(10.0, gt=0, description="measurements beyond this do not count [m]")
@@ -468,19 +467,13 @@ class Config(_Group):
 
         Poses that are given stay as they are and can be believed, so there is no bundle adjustment, and new features
         start from the measured depth unless that is off. With direct registration the tracker refines keyframes itself.
-        By the direct loss no sample lies where nothing was seen, so grids are in blocks.
         """
         given, mapping = self.tracking.use_given_poses, self.mapping
         derived = {
             "bundle_adjustment": mapping.bundle_adjustment and not given and self.tracking.optimizer != "direct",
             "depth_start": given if mapping.depth_start is None else mapping.depth_start,
         }
-        layout = self.grid.layout or ("blocks" if mapping.loss == "direct" else "dense")
-        groups = {
-            "mapping": mapping.model_copy(update=derived),
-            "grid": self.grid.model_copy(update={"layout": layout}),
-        }
-        return self.model_copy(update=groups)._at_scale()
+        return self.model_copy(update={"mapping": mapping.model_copy(update=derived)})._at_scale()
 
     def _at_scale(self) -> Config:
         """These settings with every length multiplied by ``scene_scale``, which is then 1."""

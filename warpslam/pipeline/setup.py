@@ -146,7 +146,7 @@ def load_kernels(
         ConfigError: There is no such device.
     """
     check_device(device)
-    layout = (config or Config()).resolved().grid.layout or "dense"
+    layout = (config or Config()).grid.layout
     return compile_kernels(wp.get_device(device), report, getattr(sequence, "warp_modules", ()), [layout])
 
 

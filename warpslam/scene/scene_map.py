@@ -175,7 +175,7 @@ class SceneMap:
     @property
     def layout(self) -> str:
         """Of rows: "dense", or in "blocks", which `make_room` makes."""
-        return self.config.layout or "dense"
+        return self.config.layout
 
     @phase("growth")
     def make_room(
