@@ -97,7 +97,7 @@ class Slam:
         self.device = named_device(device)
         self.seed = seed
         start = time.perf_counter()
-        compile_kernels(self.device)
+        compile_kernels(self.device, layouts=[self.config.grid.layout])
         self.compile_seconds = time.perf_counter() - start
         self.scene = SceneMap(decoders or load_decoders(self.config.decoders), self.config.grid, self.device, seed)
         self.history = FrameHistory()

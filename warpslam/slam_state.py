@@ -12,11 +12,12 @@ import numpy as np
 import warp as wp
 
 from warpslam.camera import FrameMotion, Intrinsics, SensorTiming
-from warpslam.config import Config
+from warpslam.config import Config, GridConfig
 from warpslam.errors import ConfigError, InputError
 from warpslam.field.decoders import LEVELS, Decoders, DecoderWeights, expected_shapes
 from warpslam.frames import check_settings
 from warpslam.kernels.decoder.layout import COLOR_WEIGHT_ROWS
+from warpslam.kernels.grid import BLOCK, BLOCK_ROWS
 from warpslam.loops.closer import LoopFigures, LoopState
 from warpslam.poses import MAX_DISTANCE, are_rigid
 from warpslam.runtime.cores import slice_count
@@ -24,14 +25,14 @@ from warpslam.scene.feature_grid import GridState
 from warpslam.scene.image_pool import CompactImage
 from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
-from warpslam.scene.scene_map import SceneState
+from warpslam.scene.scene_map import SceneState, is_in_blocks
 from warpslam.scene.touched_rows import TouchedRowsState
 from warpslam.storage.state_file import StateFields, StateFormat, read_state, write_state
 from warpslam.tracking.direct.timing import TimingState
 from warpslam.tracking.direct.tracker import DirectState
 from warpslam.trajectory import HistoryState
 
-MAP_FORMAT = StateFormat("warpslam-map", 7, "the map of a run with --method nice-slam")
+MAP_FORMAT = StateFormat("warpslam-map", 8, "the map of a run with --method nice-slam")
 
 
 @dataclass(frozen=True)
@@ -159,6 +160,8 @@ def state_arrays(state: SlamState) -> tuple[dict[str, Any], dict[str, np.ndarray
         arrays[f"grid_{level}_shape"] = np.array(grid.shape, np.int64)
         arrays[f"grid_{level}"] = grid.features
         arrays[f"grid_{level}_seen"] = grid.seen
+        if grid.blocks is not None:
+            arrays[f"grid_{level}_blocks"] = grid.blocks
     for level, rows in state.optimizer.items():
         arrays[f"optimizer_{level}_rows"] = rows.rows
         arrays[f"optimizer_{level}_updates"] = rows.updates
@@ -209,7 +212,7 @@ def state_from_arrays(
     seen = fields.frames("seen", count)
     depths = fields.array("seen", np.uint16, (len(seen), *_seen_size(camera)))
     low, high = _within(fields, "bounds", (2, 3), -2 * MAX_DISTANCE, 2 * MAX_DISTANCE).copy()
-    grids = {level: _grid(fields, level, getattr(saved.grid, f"{level}_spacing"), low, high) for level in LEVELS}
+    grids = {level: _grid(fields, level, saved.grid, low, high) for level in LEVELS}
     if len({0 in grid.shape for grid in grids.values()}) > 1:
         raise fields.damaged("grid_middle_shape", "some levels are empty, and some are not")
     decoders = Decoders(*(_decoder(fields, level) for level in LEVELS))
@@ -234,7 +237,7 @@ def state_from_arrays(
         digest=digest,
         timing_state=_timing_state(fields, count),
         loops=_loops(fields, count, len(frames)),
-        optimizer=_optimizer(fields),
+        optimizer=_optimizer(fields, grids),
     )
 
 
@@ -259,7 +262,8 @@ def _motion(fields: StateFields, name: str, values: np.ndarray) -> FrameMotion:
     return motion
 
 
-def _grid(fields: StateFields, level: str, spacing: float, low: np.ndarray, high: np.ndarray) -> GridState:
+def _grid(fields: StateFields, level: str, config: GridConfig, low: np.ndarray, high: np.ndarray) -> GridState:
+    spacing = getattr(config, f"{level}_spacing")
     shape = fields.array(f"grid_{level}_shape", np.int64, (3,))
     first = fields.array(f"grid_{level}_first", np.int64, (3,)).copy()
     nx, ny, nz = shape.tolist()
@@ -269,23 +273,42 @@ def _grid(fields: StateFields, level: str, spacing: float, low: np.ndarray, high
         beyond = max(float((ends[0] - low).max()), float((high - ends[1]).max()))
         if min(nx, ny, nz) < 2 or beyond > 1e-3 * spacing or np.abs(ends).max() > 3 * MAX_DISTANCE:
             raise fields.damaged(f"grid_{level}_shape", f"{nx} x {ny} x {nz} from {first.tolist()} on does not fit")
-    rows = nx * ny * nz
+    rows, blocks = nx * ny * nz, None
+    if is_in_blocks(level, config):
+        blocks = _blocks(fields, level, first, shape)
+        rows = BLOCK_ROWS * len(blocks)
     return GridState(
         first,
         (nx, ny, nz),
         fields.array(f"grid_{level}", np.float32, (rows, 32)),
         fields.array(f"grid_{level}_seen", np.uint8, (rows,)),
+        blocks,
     )
 
 
-def _optimizer(fields: StateFields) -> dict[str, TouchedRowsState]:
+def _blocks(fields: StateFields, level: str, first: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Those of a grid's box that were made, each once."""
+    name = f"grid_{level}_blocks"
+    blocks = fields.array(name, np.int64, (None, 3)).copy()
+    low, high = first // BLOCK, (first + shape - 1) // BLOCK
+    if len(blocks) and (not shape.all() or (blocks < low).any() or (blocks > high).any()):
+        raise fields.damaged(name, f"not all lie in the grid, {low.tolist()} to {high.tolist()}")
+    if len(np.unique(blocks, axis=0)) != len(blocks):
+        raise fields.damaged(name, "a block is there twice")
+    return blocks
+
+
+def _optimizer(fields: StateFields, grids: dict[str, GridState]) -> dict[str, TouchedRowsState]:
     levels = fields.header.get("optimizer")
     if not isinstance(levels, list) or not set(levels) <= {*LEVELS, "decoder"}:
         raise fields.damaged("optimizer", f"{levels!r} are no levels")
     result = {}
     for level in levels:
         is_grid = level != "decoder"
-        total = int(np.prod(fields.array(f"grid_{level}_shape", np.int64, (3,)))) if is_grid else COLOR_WEIGHT_ROWS
+        total = COLOR_WEIGHT_ROWS
+        if is_grid:
+            grid = grids[level]
+            total = len(grid.seen) + (0 if grid.blocks is None else BLOCK_ROWS)
         rows = fields.array(f"optimizer_{level}_rows", np.int32, (None if is_grid else total,))
         if len(rows) and (rows[0] < 0 or rows[-1] >= total or (np.diff(rows) <= 0).any()):
             raise fields.damaged(f"optimizer_{level}_rows", f"not ascending rows below {total}")
@@ -435,3 +458,7 @@ def _check_same_map(source: str, saved: Config, config: Config) -> None:
         ours, theirs = getattr(config.grid, name), getattr(saved.grid, name)
         if ours != theirs:
             raise ConfigError(f"grid.{name} = {ours} does not fit the map {source}, which has {theirs}")
+    if config.grid.layout != saved.grid.layout:
+        raise ConfigError(
+            f"grid.layout = {config.grid.layout} does not fit the map {source}, which is {saved.grid.layout}"
+        )

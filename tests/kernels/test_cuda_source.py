@@ -10,7 +10,7 @@ from warpslam.field.objectives import choose_inliers, gauss_newton_step
 from warpslam.field.passes import render
 from warpslam.kernels.decoder import build
 
-BUILDS = {"cpu": build.CPU, "cuda": build.CUDA}
+BUILDS = {target: build.KERNELS[target, "dense"] for target in ("cpu", "cuda")}
 
 
 def iterations(scene, stage: str = "color") -> dict[str, Iteration]:

@@ -113,7 +113,8 @@ def test_frustum_mask(scene, device, level):
     lattice = field_on_device(scene.field(), device).lattices[level]
     camera = Intrinsics(scene.fx, scene.fy, scene.cx, scene.cy, scene.width, scene.height)
     depth = wp.array(scene.depth_image, dtype=float, device=device)
-    mask = select_in_frustum(lattice, scene.lattices[level].shape, camera, scene.frustum_pose, depth, 0.5)
+    rows = int(np.prod(scene.lattices[level].shape))
+    mask = select_in_frustum(lattice, rows, camera, scene.frustum_pose, depth, 0.5)
     assert np.array_equal(mask, scene.frustum[level])
 
 

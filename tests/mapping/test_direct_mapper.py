@@ -9,7 +9,7 @@ from warpslam.camera import Intrinsics
 from warpslam.config import Config
 from warpslam.mapping.direct_mapper import DirectMapper
 from warpslam.mapping.mapper import Mapper
-from warpslam.scene.feature_grid import FeatureGrid
+from warpslam.scene.scene_map import new_grid
 from warpslam.slam import Slam
 from warpslam.synthetic import SyntheticSequence
 
@@ -18,6 +18,7 @@ SETTINGS = [
     "tracking.use_given_poses=true", "mapping.pixels=160", "mapping.first_iterations=12", "keyframes.every=2",
     "mapping.refinement_rounds=2", "grid.fine_spacing=0.16",
 ]  # fmt: skip
+LAYOUTS = ["grid.layout=dense", "grid.layout=blocks"]
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,8 @@ def step(slam: Slam, frames) -> Slam:
 def assert_same(one: Slam, other: Slam) -> None:
     """Every feature, the colour decoder and the optimiser are the same to the bit."""
     for level, grid in one.scene.grids.items():
-        np.testing.assert_array_equal(grid.features.numpy(), other.scene.grids[level].features.numpy(), level)
+        for field, value in vars(grid.state()).items():
+            np.testing.assert_array_equal(value, getattr(other.scene.grids[level].state(), field), f"{level} {field}")
     decoders = one.scene.decoders["color"].weights, other.scene.decoders["color"].weights
     np.testing.assert_array_equal(*(weights.numpy() for weights in decoders))
     states = one.mapper.state(), other.mapper.state()
@@ -73,14 +75,16 @@ def test_the_logit_becomes_the_signed_distance(frames):
     assert np.mean(logit(-0.4) < -0.5) > 0.9
 
 
-def test_two_runs_are_the_same(frames):
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_two_runs_are_the_same(frames, layout):
     """Threads and places of rows leave no trace."""
-    assert_same(*(step(new(), frames[:4]) for _ in range(2)))
+    assert_same(*(step(new(layout), frames[:4]) for _ in range(2)))
 
 
-def test_a_saved_map_goes_on_as_if_it_had_not_been(frames, tmp_path):
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_saved_map_goes_on_as_if_it_had_not_been(frames, tmp_path, layout):
     """Moments, step counts and the colour decoder's are in the file: what follows, refinement too, is the same."""
-    whole = step(new(), frames[:3])
+    whole = step(new(layout), frames[:3])
     whole.save(tmp_path / "map.safetensors")
     resumed = Slam.load(tmp_path / "map.safetensors", "cpu")
     assert_same(resumed, whole)
@@ -89,15 +93,19 @@ def test_a_saved_map_goes_on_as_if_it_had_not_been(frames, tmp_path):
     assert_same(resumed, whole)
 
 
-def test_beside_tracking_the_tracker_gets_the_rows_that_changed(frames):
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_beside_tracking_the_tracker_gets_the_rows_that_changed(frames, layout):
     """With the overlapped schedule both maps are the same when all is taken over, and after the final refinement."""
-    slam = step(new("schedule=overlapped"), frames[:4])
+    slam = step(new("schedule=overlapped", layout), frames[:4])
     slam.wait()
     assert slam.mapper.scene is not slam.scene
     for last in (slam.wait, slam.finish):
         last()
         for level, grid in slam.mapper.scene.grids.items():
-            np.testing.assert_array_equal(grid.features.numpy(), slam.scene.grids[level].features.numpy(), level)
+            for field, value in vars(grid.state()).items():
+                np.testing.assert_array_equal(
+                    value, getattr(slam.scene.grids[level].state(), field), f"{level} {field}"
+                )
 
 
 @pytest.mark.parametrize("frozen", ["middle", "fine"])
@@ -105,9 +113,9 @@ def test_a_frozen_level_stays_as_it_began(frames, frozen):
     """The other levels are optimised, and the coarse one waits for the end."""
     slam = step(new(f"mapping.optimize_{frozen}=false"), frames[:2])
     for level, grid in slam.scene.grids.items():
-        initial = FeatureGrid(level, grid.spacing, grid.std, slam.seed, slam.device)
+        initial = new_grid(level, slam.config.grid, slam.seed, slam.device)
         initial.update_from(grid, None)
-        is_same = np.array_equal(initial.features.numpy(), grid.features.numpy())
+        is_same = np.array_equal(initial.state().features, grid.state().features)
         assert is_same == (level in ("coarse", frozen)), level
 
 

@@ -13,6 +13,7 @@ import warpslam
 from tests.fakes import FakeSequence
 from tests.test_slam import new_slam
 from warpslam import cli
+from warpslam.config import Config
 from warpslam.errors import ConfigError
 from warpslam.pipeline import run as pipeline
 from warpslam.profiling import recorder
@@ -21,6 +22,7 @@ from warpslam.runtime.compilation import (
     ModuleProgress,
     compile_for_architecture,
     compile_kernels,
+    decoder_module,
     find_module,
     module_names,
 )
@@ -34,30 +36,33 @@ SMALL = ["warpslam.views"]
 @pytest.fixture
 def empty_cache(monkeypatch, tmp_path):
     """A kernel cache that holds nothing, and a run that needs one small module; afterwards all is as it was."""
-    monkeypatch.setattr(compilation, "module_names", lambda target: SMALL)
+    monkeypatch.setattr(compilation, "module_names", lambda target, layouts=(): SMALL)
     monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "cache"))
     find_module(SMALL[0]).unload()
     yield tmp_path / "cache"
     find_module(SMALL[0]).unload()
 
 
-@pytest.mark.parametrize("optimizer", ["adam", "direct"])
-def test_nothing_is_loaded_after_the_start(monkeypatch, optimizer):
+@pytest.mark.parametrize(("optimizer", "layout"), [("adam", "dense"), ("direct", "dense"), ("direct", "blocks")])
+def test_nothing_is_loaded_after_the_start(monkeypatch, optimizer, layout):
     """A run down to its mesh launches kernels only from modules, and block sizes, that were loaded beforehand."""
     monkeypatch.setattr(recorder, "matrix_peak_gflops", lambda: 1.0)
     room = SyntheticSequence(1, 8, intrinsics=new_slam().intrinsics)
+    config = Config.from_preset("default", [f"grid.layout={layout}"])
     for name in [*module_names("cpu"), *room.warp_modules]:
         find_module(name).unload()
-    pipeline.load_kernels(room, "cpu")
+    pipeline.load_kernels(room, "cpu", config=config)
     with warpslam.profile() as profile:
-        doubtful = "direct.sure_correlation=1"  # features are asked, too
-        slam = new_slam("mapping.first_iterations=12", f"tracking.optimizer={optimizer}", doubtful)
+        settings = [f"tracking.optimizer={optimizer}", f"grid.layout={layout}", "mapping.first_iterations=12"]
+        slam = new_slam(*settings, "direct.sure_correlation=1")  # features are asked, too
         for n in range(3):
             slam.step(room[n].rgb, room[n].depth, T_world_camera=room[n].T_world_camera)
         slam.mesh(voxel=0.2)
     assert slam.keyframes and profile.launches
     assert optimizer != "direct" or slam.direct.counts["searched"] == 2
     assert [module.module for module in profile.report.modules] == []
+    other = decoder_module("cpu", "dense" if layout == "blocks" else "blocks")
+    assert not find_module(other).execs, "a run needs the decoders of one layout"
 
 
 def test_compiles_once_and_says_so(empty_cache):
@@ -78,7 +83,7 @@ def test_modules_load_side_by_side(monkeypatch):
     monkeypatch.setattr(compilation, "process_cores", lambda: [0, 1])
     together = threading.Barrier(2, timeout=20)
     names, seen, inside = ["warpslam.kernels.losses", "warpslam.kernels.adam"], [], []
-    monkeypatch.setattr(compilation, "module_names", lambda target: names)
+    monkeypatch.setattr(compilation, "module_names", lambda target, layouts: names)
     monkeypatch.setattr(wp, "force_load", lambda *args, **kwargs: together.wait())
 
     def report(progress: ModuleProgress) -> None:

@@ -21,7 +21,7 @@ def slam_of(poses: list[np.ndarray], *, mapped: tuple[int, ...] | None = None, d
     """Keyframes that look at a wall; ``mapped`` are those that left a depth image."""
     mapped = tuple(range(len(poses))) if mapped is None else mapped
     seen = [SeenDepth.of(n, np.full((120, 160), depth, np.float32)) for n in mapped]
-    grid = SimpleNamespace(spacing=0.32, shape=(2, 3, 4), features=SimpleNamespace(capacity=24 * 128), row_count=24)
+    grid = SimpleNamespace(spacing=0.32, shape=(2, 3, 4), bytes=24 * 128)
     return SimpleNamespace(
         keyframes=[Keyframe(n, n + 1, T) for n, T in enumerate(poses)],
         scene=SimpleNamespace(grids={"middle": grid}, bounds=(np.zeros(3), np.ones(3))),

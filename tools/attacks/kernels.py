@@ -104,8 +104,8 @@ def attempt(rng: np.random.Generator) -> str:
     looked_up, vertex_depth = wp.zeros(rows, dtype=float, device=CPU), wp.zeros(rows, dtype=float, device=CPU)
     largest = wp.zeros(1, dtype=float, device=CPU)
     arguments = [level.lattice, matrix(), view, image(), looked_up, vertex_depth, largest]
-    wp.launch(frustum.project_vertices, SHAPE, arguments, device=CPU)
-    wp.launch(seen.mark_seen, SHAPE, [level.lattice, matrix(), view, image(), 0.1, chosen], device=CPU)
+    wp.launch(frustum.project_vertices, rows, arguments, device=CPU)
+    wp.launch(seen.mark_seen, rows, [level.lattice, matrix(), view, image(), 0.1, chosen], device=CPU)
 
     views = struct(
         visibility.Views,

@@ -609,7 +609,7 @@ def repeat(device: str) -> Figures:
     a, b = (_slam_over(camera, frames, "default", overrides, device) for _ in range(2))
     difference: Figures = {"poses": float(np.abs(a.trajectory.poses - b.trajectory.poses).max())}
     for level in a.scene.grids:
-        x, y = (run.scene.grids[level].features.numpy() for run in (a, b))
+        x, y = (run.scene.grids[level].state().features for run in (a, b))
         difference[level] = float(np.abs(x - y).max()) if x.shape == y.shape else f"shapes {x.shape} {y.shape}"
     return {**difference, "equal": all(value == 0.0 for value in difference.values())}
 

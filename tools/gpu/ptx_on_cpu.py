@@ -343,7 +343,7 @@ def install(**options: bool) -> Runner:
     _replace(program._run_all, run_all)
     _replace(cores.slice_count, lambda device: 1)
     kernels_of = ray_batch.decoders_for
-    _replace(kernels_of, lambda device: kernels_of(SimpleNamespace(is_cuda=True)))
+    _replace(kernels_of, lambda device, layout="dense": kernels_of(SimpleNamespace(is_cuda=True), layout))
     return runner
 
 

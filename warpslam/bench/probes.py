@@ -23,7 +23,7 @@ from warpslam.poses import orthonormalized
 from warpslam.runs.given_poses import GivenPoses
 from warpslam.scene.feature_grid import FeatureGrid
 from warpslam.scene.image_pool import ImagePool
-from warpslam.scene.scene_map import SceneMap
+from warpslam.scene.scene_map import SceneMap, new_grid
 from warpslam.slam import Slam
 from warpslam.storage.json_files import read_json, write_json
 
@@ -116,7 +116,7 @@ def outside_change(job: Job) -> dict[str, Any]:
 
     def snapshot(level: str) -> FeatureGrid:
         grid = slam.scene.grids[level]
-        copy = FeatureGrid(level, grid.spacing, grid.std, slam.seed, device)
+        copy = new_grid(level, slam.config.grid, slam.seed, device)
         copy.restore(grid.state())
         return copy
 
@@ -134,10 +134,11 @@ def outside_change(job: Job) -> dict[str, Any]:
         for level, old in before.items():
             grid = slam.scene.grids[level]
             old.update_from(grid, None)
+            rows = grid.row_count
             inside = select_in_frustum(
-                grid.lattice, grid.shape, camera, result.T_world_camera, depth, config.mapping.frustum_margin
+                grid.lattice, rows, camera, result.T_world_camera, depth, config.mapping.frustum_margin
             )
-            change = np.abs(grid.features.numpy() - old.features.numpy()).max(axis=1)[~inside]
+            change = np.abs(grid.features.numpy()[:rows] - old.features.numpy()[:rows]).max(axis=1)[~inside]
             known = levels[level]
             known["largest"] = max(known["largest"], float(change.max(initial=0.0)))
             known["changed"] += int((change > 0).sum())
@@ -160,7 +161,7 @@ def _open(job: Job) -> tuple[RgbdSequence, Config, Iterator[tuple[Frame, np.ndar
     # Poses are used here, not given to tracking: what the settings say of it stays as it is.
     config = replace(request, poses=None).settings(sequence.preset)
     sequence = as_configured(sequence, config)
-    load_kernels(sequence, request.device)
+    load_kernels(sequence, request.device, config=config)
     given = None if request.poses is None else GivenPoses.read(request.poses)
 
     def frames() -> Iterator[tuple[Frame, np.ndarray]]:

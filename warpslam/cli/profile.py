@@ -76,7 +76,7 @@ def _input(options: argparse.Namespace) -> tuple[RgbdSequence, Config]:
 def _run(sequence: RgbdSequence, config: Config, selected: range, options: argparse.Namespace) -> Profile:
     with Profile() as result:
         with phase("setup"):
-            load_kernels(sequence, options.device)
+            load_kernels(sequence, options.device, config=config)
             slam = build_slam(sequence.intrinsics, config, options.device, options.seed, timing=sequence.timing)
         for index in selected:
             with phase("reading"):

@@ -38,6 +38,11 @@ class GridConfig(_Group):
     middle_std: float = Field(0.01, ge=0, description="standard deviation of the initial middle features")
     fine_std: float = Field(0.0001, ge=0, description="standard deviation of the initial fine features")
     color_std: float = Field(0.01, ge=0, description="standard deviation of the initial colour features")
+    layout: Literal["dense", "blocks"] = Field(
+        "dense",
+        description="rows of the middle, fine and colour level: one for every vertex of the map's box; or in blocks of "
+        "4 x 4 x 4 vertices where something was seen, so that memory follows that; same results with the direct loss",
+    )
     margin: float = Field(0.6, gt=0, description="the map reaches this far beyond what was seen [m]")
     max_depth: float = Field(10.0, gt=0, description="measurements beyond this do not count [m]")
     max_gigabytes: float = Field(

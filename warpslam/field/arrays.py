@@ -10,6 +10,7 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.field.packing import PackedDecoder
+from warpslam.kernels import dense
 from warpslam.kernels.compositing import Box
 from warpslam.kernels.grid import Lattice, Level, Vec32
 from warpslam.kernels.pixels import Camera
@@ -57,9 +58,23 @@ class FieldArrays:
         """The map's bound as the kernels take it."""
         return struct(Box, low=self.low, high=self.high)
 
-    def level(self, name: str) -> Level:
-        """A grid as the kernels take it."""
-        return struct(Level, lattice=self.lattices[name], features=self.features[name])
+    @property
+    def layout(self) -> str:
+        """How the rows are laid out, "dense" or "blocks", which tells the decoder kernels that read them."""
+        return "blocks" if any(lattice.shared for lattice in self.lattices.values()) else "dense"
+
+    def lattice(self, name: str) -> Lattice | dense.Lattice:
+        """A lattice as the decoder kernels take it."""
+        lattice = self.lattices[name]
+        if self.layout == "blocks":
+            return lattice
+        parts = {part: getattr(lattice, part) for part in ("origin", "inverse_spacing", "shape")}
+        return struct(dense.Lattice, **parts)
+
+    def level(self, name: str) -> Level | dense.Level:
+        """A grid as the decoder kernels take it."""
+        kind = Level if self.layout == "blocks" else dense.Level
+        return struct(kind, lattice=self.lattice(name), features=self.features[name])
 
 
 @dataclass
@@ -98,6 +113,13 @@ def gradient_buffers(row_count: int, device: wp.Device, count: int | None = None
     default.
     """
     return wp.zeros((count or slice_count(device), row_count), dtype=Vec32, device=device)
+
+
+def lazy_zeros(shape: tuple[int, ...], device: wp.Device) -> wp.array:
+    """Zeros of `Vec32`; on the CPU memory is taken where it is written to first, and most rows never are."""
+    if device.is_cuda or not all(shape):
+        return wp.zeros(shape, dtype=Vec32, device=device)
+    return wp.array(np.zeros((*shape, 32), np.float32), dtype=Vec32, device=device, copy=False)
 
 
 def entries(rows: wp.array) -> wp.array:

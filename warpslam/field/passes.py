@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -11,6 +12,7 @@ from warpslam.field.arrays import EXACT, FieldArrays, Gradients, Thresholds, ent
 from warpslam.field.ray_batch import RayBatch
 from warpslam.kernels import by_sample, compositing, rays, touched_rows
 from warpslam.kernels.compositing import Listed
+from warpslam.kernels.decoder.build import decoders_for
 from warpslam.kernels.decoder.layout import OUT_32, OUT_64, RUN, WEIGHT_SECTIONS, RowGradient, WeightGradient, Weights
 from warpslam.kernels.samples import Span
 from warpslam.runtime.launching import Step
@@ -98,10 +100,10 @@ def geometry_adjoint(
     scatter = _scatter(batch, arrays, level, gradients, listed, stop - first)
     if level == "coarse":
         inputs += [batch.logit_grad, _grid_gradient(batch, gradients, level)]
-        return [(batch.kernels.coarse_backward, dim, inputs), *scatter]
+        return [(_kernels(batch, arrays).coarse_backward, dim, inputs), *scatter]
     inputs += [OUT_64 if level == "fine" else OUT_32, batch.logit_grad, _grid_gradient(batch, gradients, level)]
     inputs += [int(gradients.points), batch.point_grad]
-    return [(batch.kernels.geometry_backward, dim, inputs), *scatter]
+    return [(_kernels(batch, arrays).geometry_backward, dim, inputs), *scatter]
 
 
 def color_adjoint(
@@ -120,11 +122,11 @@ def color_adjoint(
     inputs = [listed, blocks, batch.rays, arrays.level("color"), _weights(batch, arrays, "color"), batch.color_grad]
     inputs += [_grid_gradient(batch, gradients, "color"), int(gradients.points), point_grad, weights]
     threads = -(-batch.kernels.thread_count((stop - first) * batch.sample_count) // blocks)
-    result: list[Step] = [(batch.kernels.color_backward, threads, inputs)]
+    result: list[Step] = [(_kernels(batch, arrays).color_backward, threads, inputs)]
     result += _scatter(batch, arrays, "color", gradients, listed, stop - first)
     if gradients.color_weights is not None and batch.kernels.by_sample:
         dim = (gradients.color_weights.shape[0], WEIGHT_SECTIONS, 32)
-        result.append((batch.kernels.color_weights, dim, [listed, batch.rays, batch.color_grad, weights]))
+        result.append((_kernels(batch, arrays).color_weights, dim, [listed, batch.rays, batch.color_grad, weights]))
     return result
 
 
@@ -143,8 +145,8 @@ def _scatter(
     """Where samples store the gradients of their features: bring them to the rows of the grid."""
     if not batch.kernels.by_sample or level not in gradients.grids:
         return []
-    inputs = [listed, batch.rays, arrays.lattices[level], _grid_gradient(batch, gradients, level)]
-    return [(batch.kernels.scatter_features, (-(-ray_count * batch.sample_count // RUN), 32), inputs)]
+    inputs = [listed, batch.rays, arrays.lattice(level), _grid_gradient(batch, gradients, level)]
+    return [(_kernels(batch, arrays).scatter_features, (-(-ray_count * batch.sample_count // RUN), 32), inputs)]
 
 
 def begin_rays(batch: RayBatch, first: int, stop: int, slot: int) -> Step:
@@ -172,7 +174,7 @@ def logits(
     thresholds: Thresholds,
 ) -> list[Step]:
     """Occupancy logits (Eq. 1-3) of some samples of the rays ``first`` to ``stop``."""
-    kernels, count = batch.kernels, (stop - first) * width
+    kernels, count = _kernels(batch, arrays), (stop - first) * width
     dim = kernels.thread_count(count)
     span = struct(Span, point_count=count, first_ray=first, first_sample=sample, width=width)
     points = [span, thresholds.min_transmittance, batch.transmittance, batch.rays]
@@ -236,7 +238,11 @@ def color_forward(
     """Colour (Eq. 5) of the samples that are listed for it."""
     inputs = [color_list(batch, first, slot), batch.rays, arrays.level("color")]
     inputs += [_weights(batch, arrays, "color"), _weight_gradient(batch, weight_gradient), batch.color]
-    return (batch.kernels.color_forward, batch.kernels.thread_count((stop - first) * batch.sample_count), inputs)
+    return (
+        _kernels(batch, arrays).color_forward,
+        batch.kernels.thread_count((stop - first) * batch.sample_count),
+        inputs,
+    )
 
 
 def _adjoint(
@@ -343,6 +349,11 @@ def _composited_backward_by_sample(
         (by_sample.composite_backward, (stop - first) * batch.sample_count, inputs),
         (by_sample.list_steep, stop - first, steep),
     ]
+
+
+def _kernels(batch: RayBatch, arrays: FieldArrays) -> SimpleNamespace:
+    """The decoder kernels for the grids' layout."""
+    return batch.kernels if arrays.layout == "dense" else decoders_for(batch.device, arrays.layout)
 
 
 def _listed(batch: RayBatch, first: int, slot: int, samples: wp.array, counts: wp.array) -> Listed:

@@ -7,7 +7,7 @@ measured surface (bilinear depth at its pixel; the largest looked-up depth where
 
 import warp as wp
 
-from warpslam.kernels.grid import Lattice, row_of, vertex_position
+from warpslam.kernels.grid import Lattice, row_position
 from warpslam.kernels.pixels import Camera, place_of
 
 MODULE = "warpslam.views"
@@ -44,9 +44,8 @@ def project_vertices(
     max_depth: wp.array[float],
 ):
     """First pass: depth of the vertex (-1 where it projects outside the image) and measured depth at its pixel."""
-    i, j, k = wp.tid()
-    row = row_of(lattice, i, j, k)
-    p = vertex_position(lattice, i, j, k)
+    row = lattice.shared + wp.tid()
+    p = row_position(lattice, row)
     q = wp.transform_point(T_camera_world, p)
     # The released code divides by (z - 1e-5) with its camera looking along -z.
     depth = q[2] - 1.0e-5
@@ -69,9 +68,8 @@ def select_vertices(
     max_depth: wp.array[float],
     selected: wp.array[wp.uint8],
 ):
-    i, j, k = wp.tid()
-    row = row_of(lattice, i, j, k)
-    p = vertex_position(lattice, i, j, k)
+    row = lattice.shared + wp.tid()
+    p = row_position(lattice, row)
     measured = looked_up[row]
     if measured == 0.0:
         measured = max_depth[0]

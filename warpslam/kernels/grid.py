@@ -7,6 +7,11 @@ A level stores one row of 32 features per lattice vertex, array ``features`` of 
 
 Adjoint for an incoming gradient dc: ``grad[place[row]] += w_corner * dc`` for rows that have a place, and
 ``dp = sum_corner (dw_corner / du) (dc . features[row]) / spacing``, zero along an axis that was clamped.
+
+Rows are laid out in one of two ways. Dense: one for each vertex of the box, in the order of i, j, k. In blocks: the box
+is cut into blocks of 4 x 4 x 4 vertices at whole multiples of 4 of the world lattice, and only blocks that were made
+have rows, in the order in which they were made; their features begin as those of a dense grid. All others share the
+first 64, which are random, too, and never written.
 """
 
 import warp as wp
@@ -15,14 +20,35 @@ FEATURE_DIM = 32
 Vec32 = wp.types.vector(length=FEATURE_DIM, dtype=wp.float32)
 Vec16 = wp.types.vector(length=FEATURE_DIM // 2, dtype=wp.float32)
 
+BLOCK = 4
+"""Vertices of a block along each axis. At a spacing of 8 cm a block of 8 would be wider than what stands in a room."""
+
+BLOCK_ROWS = BLOCK**3
+
 
 @wp.struct
 class Lattice:
-    """Vertex (i, j, k) lies at ``origin + (i, j, k) / inverse_spacing`` [m]."""
+    """Vertex (i, j, k) lies at ``origin + (i, j, k) / inverse_spacing`` [m].
+
+    Of a lattice in blocks (all zero of a dense one):
+
+    shared: Rows that the vertices without rows of their own share; the rows from there on are written to.
+    first: World lattice index of vertex (0, 0, 0).
+    offset: Where vertex (0, 0, 0) lies in its block.
+    blocks: Blocks of the box along each axis.
+    table: First row of each block of the box, 0 of those that were not made.
+    corners: World lattice index of the first vertex of each block that was made, in their order.
+    """
 
     origin: wp.vec3
     inverse_spacing: wp.vec3
     shape: wp.vec3i
+    shared: int
+    first: wp.vec3i
+    offset: wp.vec3i
+    blocks: wp.vec3i
+    table: wp.array[int]
+    corners: wp.array[wp.vec3i]
 
 
 @wp.struct
@@ -47,7 +73,23 @@ class Cell:
 @wp.func
 def row_of(lattice: Lattice, i: int, j: int, k: int) -> int:
     """Row of a lattice vertex. Everything that touches features goes through here."""
-    return (i * lattice.shape[1] + j) * lattice.shape[2] + k
+    if lattice.shared == 0:
+        return (i * lattice.shape[1] + j) * lattice.shape[2] + k
+    a = i + lattice.offset[0]
+    b = j + lattice.offset[1]
+    c = k + lattice.offset[2]
+    first = lattice.table[((a >> 2) * lattice.blocks[1] + (b >> 2)) * lattice.blocks[2] + (c >> 2)]
+    return first + (((a & 3) << 4) | ((b & 3) << 2) | (c & 3))
+
+
+@wp.func
+def vertex_of(lattice: Lattice, row: int) -> wp.vec3i:
+    """The vertex of a row that is not shared. Blocks reach beyond the box."""
+    if lattice.shared == 0:
+        ij = row // lattice.shape[2]
+        return wp.vec3i(ij // lattice.shape[1], ij % lattice.shape[1], row % lattice.shape[2])
+    n = row & 63
+    return lattice.corners[(row >> 6) - 1] + wp.vec3i(n >> 4, (n >> 2) & 3, n & 3) - lattice.first
 
 
 @wp.func
@@ -55,6 +97,13 @@ def vertex_position(lattice: Lattice, i: int, j: int, k: int) -> wp.vec3:
     """Where a lattice vertex lies [m]."""
     spacing = wp.cw_div(wp.vec3(1.0, 1.0, 1.0), lattice.inverse_spacing)
     return lattice.origin + wp.cw_mul(wp.vec3(float(i), float(j), float(k)), spacing)
+
+
+@wp.func
+def row_position(lattice: Lattice, row: int) -> wp.vec3:
+    """Where the vertex of a row lies that is not shared [m]."""
+    v = vertex_of(lattice, row)
+    return vertex_position(lattice, v[0], v[1], v[2])
 
 
 @wp.func
@@ -188,8 +237,8 @@ def fill_grid(
     features: wp.array[Vec32],
     seen: wp.array[wp.uint8],
 ):
-    """Fill a grid of any extent: rows of the old grid are kept, the others start random (``first``: world index of
-    vertex 0).
+    """Fill a dense grid of any extent: rows of the old grid are kept, the others start random (``first``: world index
+    of vertex 0).
     """
     i, j, k = wp.tid()
     row = row_of(lattice, i, j, k)
@@ -204,6 +253,30 @@ def fill_grid(
     else:
         features[row] = init_normal(seed, level, first[0] + i, first[1] + j, first[2] + k, std)
         seen[row] = wp.uint8(0)
+
+
+@wp.kernel(enable_backward=False)
+def fill_shared(seed: int, level: int, std: float, features: wp.array[Vec32]):
+    """The rows that the vertices of all blocks share that were not made."""
+    row = wp.tid()
+    features[row] = init_normal(seed, level, row >> 4, (row >> 2) & 3, row & 3, std)
+
+
+@wp.kernel(enable_backward=False)
+def fill_rows(
+    rows: wp.array[int],
+    lattice: Lattice,
+    seed: int,
+    level: int,
+    std: float,
+    features: wp.array[Vec32],
+    seen: wp.array[wp.uint8],
+):
+    """Rows of blocks that are listed start random, as those of a dense grid."""
+    row = rows[wp.tid()]
+    v = vertex_of(lattice, row) + lattice.first
+    features[row] = init_normal(seed, level, v[0], v[1], v[2], std)
+    seen[row] = wp.uint8(0)
 
 
 @wp.kernel(enable_backward=False)

@@ -3,7 +3,7 @@
 import warp as wp
 
 from warpslam.kernels.frustum import MODULE
-from warpslam.kernels.grid import Lattice, Vec32, row_of, vertex_position
+from warpslam.kernels.grid import Lattice, Vec32, row_position
 from warpslam.kernels.pixels import Camera, nearest_pixel
 
 
@@ -49,9 +49,9 @@ def mark_seen(
     seen: wp.array[wp.uint8],
 ):
     """Vertices in view that lie in front of the measured surface or less than ``reach`` behind it."""
-    i, j, k = wp.tid()
-    if behind_surface(vertex_position(lattice, i, j, k), T_camera_world, camera, image) <= reach:
-        seen[row_of(lattice, i, j, k)] = wp.uint8(1)
+    row = lattice.shared + wp.tid()
+    if behind_surface(row_position(lattice, row), T_camera_world, camera, image) <= reach:
+        seen[row] = wp.uint8(1)
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
@@ -66,11 +66,10 @@ def start_from_depth(
     features: wp.array[Vec32],
 ):
     """Vertices seen for the first time. Once started, a vertex is the optimiser's."""
-    i, j, k = wp.tid()
-    row = row_of(lattice, i, j, k)
+    row = lattice.shared + wp.tid()
     if selected[row] == wp.uint8(0) or seen[row] != wp.uint8(0):
         return
-    distance = behind_surface(vertex_position(lattice, i, j, k), T_camera_world, camera, image)
+    distance = behind_surface(row_position(lattice, row), T_camera_world, camera, image)
     if distance > line.reach:
         return
     seen[row] = wp.uint8(1)

@@ -45,13 +45,13 @@ class RowState:
 
 @wp.func
 def touch(touched: Touched, lattice: Lattice, p: wp.vec3):
-    """List the eight rows around a point that are not yet."""
+    """List the rows around a point that are not yet, and are not shared."""
     corner = find_cell(lattice, p).corner
     for di in range(2):
         for dj in range(2):
             for dk in range(2):
                 row = row_of(lattice, corner[0] + di, corner[1] + dj, corner[2] + dk)
-                if touched.place[row] < 0:
+                if row >= lattice.shared and touched.place[row] < 0:
                     # Only one thread finds -1.
                     if wp.atomic_max(touched.place, row, 0) < 0:
                         n = wp.atomic_add(touched.count, 0, 1)
@@ -184,7 +184,7 @@ def move_rows(
     moments: wp.array2d[Vec32],
     updates: wp.array[int],
 ):
-    """State of rows that were updated, from a grid to the one that it grew to, by ``shift`` vertices."""
+    """State of rows that were updated, from a dense grid to the one that it grew to, by ``shift`` vertices."""
     i, j, k = wp.tid()
     old = row_of(old_lattice, i, j, k)
     if old_updates[old] > 0:

@@ -69,7 +69,7 @@ class DepthStart:
         inputs = [grid.lattice, *projection(camera, T_world_camera), depth, selected, line]
         wp.launch(
             seen.start_from_depth,
-            dim=grid.shape,
+            dim=grid.own_rows,
             inputs=inputs,
             outputs=[grid.seen, grid.features],
             device=grid.device,

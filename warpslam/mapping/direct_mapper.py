@@ -28,8 +28,9 @@ from warpslam.mapping.refinement import Refinement
 from warpslam.mapping.window import random_keyframes, replayed_keyframes
 from warpslam.poses import vector_from_pose
 from warpslam.runtime.launching import Launcher
+from warpslam.scene.block_grid import reach_of
 from warpslam.scene.image_pool import ImagePool
-from warpslam.scene.keyframes import Keyframe
+from warpslam.scene.keyframes import Keyframe, PlacedImage, placed
 from warpslam.scene.optimizers import ColorDecoderOptimizer
 from warpslam.scene.scene_map import SceneMap
 from warpslam.scene.touched_rows import TouchedRows, TouchedRowsState
@@ -89,7 +90,7 @@ class DirectMapper:
         self._rows = {
             level: TouchedRows(self._launcher, scene.grids[level], capacity) for level in ("middle", "fine", "color")
         }
-        self._decoder = ColorDecoderOptimizer(self._launcher)
+        self._decoder = ColorDecoderOptimizer(self._launcher, scene.layout)
         self._decoder.begin()
         self._free: dict[str, np.ndarray] | None = None
         self._is_restricted = False
@@ -126,11 +127,14 @@ class DirectMapper:
             window = random_keyframes(keyframes, PARTS - 1, rng)
             self._optimize(images, frame, pose, window, self.config.refined_directly, round_=1 + round_)()
             changed.append(self.changed_rows())
-        refinement = Refinement(self.scene, self.camera, self.settings, list(self._rates), self.device, self.seed)
+        refinement = Refinement(
+            self.scene, self.camera, self.settings, list(self._rates), self.make_room, self.device, self.seed
+        )
         loss, window = 0.0, []
         for round_ in rounds:
             loss, window = refinement.run(images, frame, pose, keyframes, round_)
-        self._changed = _union([*changed, refinement.changed_rows()], self.device)
+            changed.append(refinement.changed_rows())
+        self._changed = _union(changed, self.device)
         return MappingResult(pose, {"color": loss}, sorted({keyframe.index for keyframe in window}))
 
     def restrict(self, free: dict[str, np.ndarray] | None, renewed: dict[str, np.ndarray]) -> None:
@@ -145,6 +149,11 @@ class DirectMapper:
                 rows.forget(renewed[level])
         self._is_restricted = free is not None
         self._free = self._free if free is None else free  # what was free has changed, until the next call
+
+    def make_room(self, images: ImagePool, pose: np.ndarray, window: list[PlacedImage]) -> None:
+        """Have rows wherever a call on the image in slot 0 and a window may have samples."""
+        views = [PlacedImage(0, pose), *window]
+        self.scene.make_room(images.arrays, views, self.camera, reach_of(self.supervision.behind))
 
     def map_again(
         self, images: ImagePool, keyframe: Keyframe, keyframes: list[Keyframe], iterations: int, round_: int
@@ -204,11 +213,12 @@ class DirectMapper:
         if not self._is_restricted:
             self._free = None
         self._changed = None
+        slots = images.bring([one.image for one in window], [one.motion for one in window])
+        self.make_room(images, pose, placed(window, slots))
         self._fit()
         for rows in self._rows.values():
             rows.begin()
         mark_seen(self.scene.grids["color"], self.camera, pose, images.metres())
-        slots = images.bring([one.image for one in window], [one.motion for one in window])
         repeats = PARTS - len(window)
         self._window.assign(np.array([*slots, *[0] * repeats], np.int32))
         poses = [vector_from_pose(T) for T in (*(one.pose for one in window), *[pose] * repeats)]
@@ -218,7 +228,8 @@ class DirectMapper:
         self._probe.measure(arrays, updates, images.arrays, pose, self.camera, len(window), seed)
 
         self._batch.set_seeds([ray_seed(self.seed, 3, frame, n, round_) for n in range(iterations)])
-        uses = [self._batch.seeds, images.rgb, *(grid.features for grid in self.scene.grids.values())]
+        uses = [self._batch.seeds, images.rgb, *(grid.lattice for grid in self.scene.grids.values())]
+        uses += [grid.features for grid in self.scene.grids.values()]
         uses += [rows.updates for rows in self._rows.values()]
         if self.config.moved_margin > 0:
             uses += [frame, round_]  # the pose is an argument of what is recorded

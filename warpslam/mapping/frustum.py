@@ -25,30 +25,30 @@ REACH = 1.75
 @phase("frustum selection")
 def select_in_frustum(
     lattice: Lattice,
-    shape: tuple[int, int, int],
+    rows: int,
     camera: Intrinsics,
     T_world_camera: np.ndarray,
     depth: wp.array,
     margin: float,
 ) -> np.ndarray:
-    """Mask of the vertices in the frustum, bool (rows,).
+    """Mask of the vertices in the frustum, bool (rows,); rows that are shared are not in it.
 
     Args:
-        lattice: Lattice of the level; ``shape`` its vertices per axis.
+        lattice: Lattice of the level.
+        rows: Its rows in use.
         camera: Intrinsics of the depth image.
         T_world_camera: Pose of the frame (4, 4).
         depth: Depth image on the device [m], float32 (H, W).
         margin: Reach behind the surface and around the camera [m].
     """
     device = depth.device
-    rows = int(np.prod(shape))
     looked_up = wp.empty(rows, dtype=float, device=device)
     vertex_depth = wp.empty(rows, dtype=float, device=device)
     max_depth = wp.zeros(1, dtype=float, device=device)
-    selected = wp.empty(rows, dtype=wp.uint8, device=device)
+    selected = wp.zeros(rows, dtype=wp.uint8, device=device)
     wp.launch(
         frustum.project_vertices,
-        dim=shape,
+        dim=rows - lattice.shared,
         inputs=[lattice, *projection(camera, T_world_camera), depth],
         outputs=[looked_up, vertex_depth, max_depth],
         device=device,
@@ -56,7 +56,7 @@ def select_in_frustum(
     )
     wp.launch(
         frustum.select_vertices,
-        dim=shape,
+        dim=rows - lattice.shared,
         inputs=[lattice, wp.vec3(*T_world_camera[:3, 3]), margin, looked_up, vertex_depth, max_depth],
         outputs=[selected],
         device=device,
@@ -73,7 +73,7 @@ def mark_seen(grid: FeatureGrid, camera: Intrinsics, T_world_camera: np.ndarray,
         camera, T_world_camera, depth: As in `select_in_frustum`.
     """
     inputs = [grid.lattice, *projection(camera, T_world_camera), depth, REACH * grid.spacing]
-    wp.launch(seen.mark_seen, grid.shape, inputs, [grid.seen], device=grid.device, record_tape=False)
+    wp.launch(seen.mark_seen, grid.own_rows, inputs, [grid.seen], device=grid.device, record_tape=False)
 
 
 def measured_extent(

@@ -27,8 +27,9 @@ from warpslam.mapping.frustum import mark_seen, select_in_frustum
 from warpslam.mapping.window import overlapping_window, random_window
 from warpslam.poses import pose_from_vector, vector_from_pose
 from warpslam.runtime.launching import Launcher
+from warpslam.scene.block_grid import reach_of
 from warpslam.scene.image_pool import ImagePool
-from warpslam.scene.keyframes import Keyframe
+from warpslam.scene.keyframes import Keyframe, PlacedImage, placed
 from warpslam.scene.optimizers import ColorDecoderOptimizer, GridOptimizer, PoseOptimizer
 from warpslam.scene.scene_map import SceneMap
 from warpslam.scene.touched_rows import TouchedRowsState
@@ -104,7 +105,7 @@ class Mapper:
         self.device, self.seed = device, seed
         self._launcher = Launcher(device)
         self._grids = {level: GridOptimizer(self._launcher) for level in LEVELS}
-        self._decoder = ColorDecoderOptimizer(self._launcher)
+        self._decoder = ColorDecoderOptimizer(self._launcher, scene.layout)
         # Refinement doubles the window; the last keyframe and the current frame come on top.
         frame_count = 2 * config.window + 2
         self._poses = PoseOptimizer(frame_count, self._launcher)
@@ -169,6 +170,15 @@ class Mapper:
         self._is_restricted = free is not None
         self._free = self._free if free is None else free  # what was free has changed, until the next call
 
+    def make_room(self, images: ImagePool, pose: np.ndarray, window: list[PlacedImage]) -> None:
+        """Have rows wherever a call on the image in slot 0 may select vertices, and where a window has measured."""
+        if self.scene.layout == "dense":
+            return
+        margin = self.config.frustum_margin
+        current, missing = PlacedImage(0, pose), float(images.current_depth().max())
+        self.scene.make_room(images.arrays, [current], self.camera, reach_of(margin, missing), around=margin)
+        self.scene.make_room(images.arrays, window, self.camera, reach_of(0.0))
+
     def map_again(
         self, images: ImagePool, keyframe: Keyframe, keyframes: list[Keyframe], iterations: int, round_: int
     ) -> MappingResult:
@@ -214,6 +224,7 @@ class Mapper:
         together = (*call.window, *coarse)
         in_use = images.bring([one.image for one in together], [one.motion for one in together])
         slots = wp.array([*in_use[: len(call.window)], 0], dtype=int, device=self.device)
+        self.make_room(images, pose, placed(together, in_use))
         self._select(images, pose, everything=refinement)
         self._launcher.forget()
 
@@ -299,10 +310,10 @@ class Mapper:
             if level in self._frozen:
                 mask = np.zeros(grid.row_count, bool)
             elif level == "coarse" or everything or not self.config.frustum_selection:
-                mask = np.ones(grid.row_count, bool)
+                mask = np.arange(grid.row_count) >= grid.lattice.shared
             else:
                 mask = select_in_frustum(
-                    grid.lattice, grid.shape, self.camera, T_world_camera, depth, self.config.frustum_margin
+                    grid.lattice, grid.row_count, self.camera, T_world_camera, depth, self.config.frustum_margin
                 )
             if self._is_restricted and self._free is not None:
                 mask = mask & self._free.get(level, np.zeros(grid.row_count, bool))

@@ -15,7 +15,7 @@ from warpslam.config import Config, MappingConfig
 from warpslam.mapping.direct_mapper import PARTS, DirectMapper
 from warpslam.mapping.mapper import Mapper, MappingResult
 from warpslam.scene.image_pool import ImagePool
-from warpslam.scene.keyframes import Keyframe
+from warpslam.scene.keyframes import Keyframe, PlacedImage
 from warpslam.scene.scene_map import SceneMap
 from warpslam.scene.touched_rows import TouchedRowsState
 
@@ -46,6 +46,9 @@ class MapOptimizer(Protocol):
 
         renewed: Rows, int (n,) by level, whose features were begun again.
         """
+
+    def make_room(self, images: ImagePool, pose: np.ndarray, window: list[PlacedImage]) -> None:
+        """Have rows wherever a call on the image in slot 0 and a window may need them."""
 
     def map_again(
         self, images: ImagePool, keyframe: Keyframe, keyframes: list[Keyframe], iterations: int, round_: int

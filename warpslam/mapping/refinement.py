@@ -7,6 +7,7 @@ little haze before a wall, and outlines a pixel too wide. A few iterations of re
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -25,7 +26,7 @@ from warpslam.mapping.window import keyframes_in_turn
 from warpslam.poses import vector_from_pose
 from warpslam.runtime.launching import Launcher
 from warpslam.scene.image_pool import ImagePool
-from warpslam.scene.keyframes import Keyframe
+from warpslam.scene.keyframes import Keyframe, PlacedImage, placed
 from warpslam.scene.optimizers import GridOptimizer
 from warpslam.scene.scene_map import SceneMap
 from warpslam.scene.touched_rows import TouchedRows
@@ -41,14 +42,23 @@ class Refinement:
         camera: Intrinsics.
         config: Settings.
         levels: Levels whose features change.
+        make_room: As `DirectMapper.make_room`.
         device: Where.
         seed: Of keyframes and rays.
     """
 
     def __init__(
-        self, scene: SceneMap, camera: Intrinsics, config: Config, levels: list[str], device: wp.Device, seed: int
+        self,
+        scene: SceneMap,
+        camera: Intrinsics,
+        config: Config,
+        levels: list[str],
+        make_room: Callable[[ImagePool, np.ndarray, list[PlacedImage]], None],
+        device: wp.Device,
+        seed: int,
     ) -> None:
         self.scene, self.camera, self.config, self.seed = scene, camera, config.mapping, seed
+        self._make_room = make_room
         sampling = self.sampling = config.sampling
         self._launcher = Launcher(device)
         samples = sampling.stratified + sampling.surface
@@ -56,12 +66,11 @@ class Refinement:
         self.rows = {
             level: TouchedRows(self._launcher, scene.grids[level], 8 * samples * self.config.pixels) for level in levels
         }
-        for rows in self.rows.values():
-            rows.begin()
         self._coarse: GridOptimizer | None = None
         if self.config.coarse:
             self._coarse = GridOptimizer(self._launcher)
-            self._coarse.begin(scene.grids["coarse"], np.ones(scene.grids["coarse"].row_count, bool))
+            grid = scene.grids["coarse"]
+            self._coarse.begin(grid, np.arange(grid.row_count) >= grid.lattice.shared)
         self._errors: CellErrors | None = None
         if self.config.active_share > 0:
             frames = self.config.refinement_frames
@@ -84,6 +93,10 @@ class Refinement:
         rng, count = np.random.default_rng([self.seed, 2, frame]), config.refinement_frames - 1
         window = keyframes_in_turn(keyframes, round_ * count, min(count, len(keyframes)), rng)
         in_use = images.bring([one.image for one in window], [one.motion for one in window])
+        self._make_room(images, pose, placed(window, in_use))
+        for level, rows in self.rows.items():
+            rows.fit(self.scene.grids[level])
+            rows.begin()
         slots = wp.array([*in_use, 0], dtype=int, device=device)
         vectors = [vector_from_pose(T) for T in (*(one.pose for one in window), pose)]
         poses = wp.array(np.array(vectors, np.float32), dtype=float, device=device)
@@ -103,7 +116,7 @@ class Refinement:
         return float(batch.loss.numpy()[0]) / max(batch.count, 1), window
 
     def changed_rows(self) -> dict[str, wp.array]:
-        """Rows of each level that may have changed, int (n,)."""
+        """Rows of each level that the last round may have changed, int (n,)."""
         changed = {level: rows.changed_rows() for level, rows in self.rows.items()}
         return changed if self._coarse is None else {**changed, "coarse": self._coarse.rows}
 

@@ -16,14 +16,15 @@ import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics
-from warpslam.field.arrays import projection
+from warpslam.field.arrays import projection, struct
 from warpslam.kernels import seen
+from warpslam.kernels.grid import Lattice
 from warpslam.mapping.frustum import REACH, measured_extent
 from warpslam.mapping.mapper import MappingResult
 from warpslam.poses import motion_between
 from warpslam.scene.feature_grid import FeatureGrid
 from warpslam.scene.image_pool import ImagePool
-from warpslam.scene.keyframes import Keyframe
+from warpslam.scene.keyframes import Keyframe, PlacedImage
 from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
 from warpslam.scene.scene_map import SceneMap
 
@@ -110,6 +111,9 @@ class RestrictedMapper(Protocol):
         (n,), whose features were begun again. None ends it.
         """
 
+    def make_room(self, images: ImagePool, pose: np.ndarray, window: list[PlacedImage]) -> None:
+        """Have rows wherever a call on the image in slot 0 and a window may need them."""
+
     def map_again(
         self, images: ImagePool, keyframe: Keyframe, keyframes: list[Keyframe], iterations: int, round_: int
     ) -> MappingResult:
@@ -140,14 +144,19 @@ class Remapping:
             scene.cover(*measured_extent(view.depth, view.after, small, stride=1))
         old = _touched(scene, small, [(view.depth, view.before) for view in self.moved])
         new = _touched(scene, small, [(view.depth, view.after) for view in self.moved])
-        free = {level: old[level] | new[level] for level in LEVELS}
-        seen_before = scene.grids["color"].seen.numpy().copy()
-        for level in LEVELS:
-            scene.grids[level].renew(np.flatnonzero(old[level]))
-        mapper.restrict(free, {level: np.flatnonzero(old[level]) for level in LEVELS})
         current, motion = images.current(), images.motion
         result = MappingResult(np.eye(4), again=True)
         try:
+            if scene.layout == "blocks":
+                for keyframe in keyframes:
+                    images.show(keyframe.image, keyframe.motion)
+                    mapper.make_room(images, keyframe.pose, [])
+            begun = {level: np.flatnonzero(scene.grids[level].rows_of(old[level])) for level in LEVELS}
+            free = {level: scene.grids[level].rows_of(old[level] | new[level]) for level in LEVELS}
+            seen_before = scene.grids["color"].seen.numpy()[: len(free["color"])].copy()
+            for level in LEVELS:
+                scene.grids[level].renew(begun[level])
+            mapper.restrict(free, begun)
             order = self._order(images, keyframes, scene.grids["fine"], old["fine"])
             count = -(-self.iterations * max(len(self.moved), len(order)) // max(len(order), 1))
             for k in order:
@@ -160,7 +169,7 @@ class Remapping:
         finally:
             images.put_back(current, motion)
             mapper.restrict(None, {})
-        seen_now = scene.grids["color"].seen
+        seen_now = scene.grids["color"].seen[: len(seen_before)]
         seen_now.assign(np.where(free["color"], seen_now.numpy(), seen_before))
         result.seconds = time.perf_counter() - start
         return result
@@ -189,8 +198,8 @@ class Remapping:
 def _touched(
     scene: SceneMap, camera: Intrinsics, views: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, np.ndarray]:
-    """Vertices of each level that mapping from some views may have changed, bool (rows,): depth [m], (H, W), and
-    T_world_camera of each.
+    """Vertices of each level that mapping from some views may have changed, bool (vertices,) of the box: depth [m],
+    (H, W), and T_world_camera of each.
     """
     return {level: touched_vertices(scene.grids[level], camera, views) for level in LEVELS}
 
@@ -199,11 +208,13 @@ def touched_vertices(
     grid: FeatureGrid, camera: Intrinsics, views: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> np.ndarray:
     """The same of one level: all corners of cells that have one in view, no further behind a surface than `REACH`."""
-    mask = wp.zeros(grid.row_count, dtype=wp.uint8, device=grid.device)
+    lattice = struct(Lattice, **{part: getattr(grid.lattice, part) for part in ("origin", "inverse_spacing", "shape")})
+    count = int(np.prod(grid.shape))
+    mask = wp.zeros(count, dtype=wp.uint8, device=grid.device)
     for depth, T_world_camera in views:
         image = wp.array(depth, dtype=float, device=grid.device)
-        inputs = [grid.lattice, *projection(camera, T_world_camera), image, REACH * grid.spacing]
-        wp.launch(seen.mark_seen, grid.shape, inputs, [mask], device=grid.device, record_tape=False)
+        inputs = [lattice, *projection(camera, T_world_camera), image, REACH * grid.spacing]
+        wp.launch(seen.mark_seen, count, inputs, [mask], device=grid.device, record_tape=False)
     touched = mask.numpy().reshape(grid.shape) != 0
     for axis in range(3):
         near, far = np.roll(touched, 1, axis), np.roll(touched, -1, axis)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from warpslam.pipeline.methods import Method
     from warpslam.sequences.base import Frame, RgbdSequence
 
-RUN_FORMAT = StateFormat("warpslam-run", 5)
+RUN_FORMAT = StateFormat("warpslam-run", 6)
 log = logging.getLogger(__name__)
 
 

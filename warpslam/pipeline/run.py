@@ -313,7 +313,7 @@ class Run:
         request, camera, timing = self.request, self.sequence.intrinsics, self.sequence.timing
         with self.record.clock("setup"), kernel_cache_errors():
             with self.record.clock("kernel_compile"):
-                self.modules = load_kernels(self.sequence, request.device, self.observer.module)
+                self.modules = load_kernels(self.sequence, request.device, self.observer.module, self.config)
             if self.saved is not None:
                 self.slam = self.saved.slam(self.config)
                 log.info("resumed from %s, after %d frames", self.saved.path, self.record.position)

@@ -135,7 +135,10 @@ def device_name(device: str | None) -> str:
 
 
 def load_kernels(
-    sequence: RgbdSequence, device: str | None, report: Callable[[ModuleProgress], None] | None = None
+    sequence: RgbdSequence,
+    device: str | None,
+    report: Callable[[ModuleProgress], None] | None = None,
+    config: Config | None = None,
 ) -> list[ModuleProgress]:
     """Load all kernels that a run over ``sequence`` needs, compiling those that never were; see
     `warpslam.runtime.compilation.compile_kernels`.
@@ -144,7 +147,8 @@ def load_kernels(
         ConfigError: There is no such device.
     """
     check_device(device)
-    return compile_kernels(wp.get_device(device), report, getattr(sequence, "warp_modules", ()))
+    layout = (config or Config()).grid.layout
+    return compile_kernels(wp.get_device(device), report, getattr(sequence, "warp_modules", ()), [layout])
 
 
 def build_slam(

@@ -251,4 +251,5 @@ _MODELS: dict[str, Model] = {
     "clear_moments": _rows(2),
     "transpose_color_weights": _rows(2),
     "fill_grid": _rows(2),
+    "fill_blocks": _rows(2),
 }

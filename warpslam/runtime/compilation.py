@@ -37,11 +37,12 @@ _STAGES = (
 _PYTHON_MODULES = {
     "warpslam.rays": ("pixels", "rays", "rejection", "samples"),
     "warpslam.supervision": ("supervision", "touched_rows"),
-    "warpslam.views": ("frustum", "images", "rectify", "seen", "visibility"),
+    "warpslam.views": ("blocks", "frustum", "images", "rectify", "seen", "visibility"),
     "warpslam.direct": ("direct.images", "direct.points", "direct.registration"),
     "warpslam.timing": ("direct.timing",),
     "warpslam.features": ("features.matching", "features.pose", "features.agreement"),
     **{f"warpslam.decoder_{target}": ("decoder.build",) for target in ("cpu", "cuda")},
+    **{f"warpslam.decoder_{target}_blocks": ("decoder.build",) for target in ("cpu", "cuda")},
     **{f"warpslam.imap_{target}": ("imap_network",) for target in ("cpu", "cuda")},
 }
 """Warp modules that hold the kernels of other Python modules of `warpslam.kernels` than the one of their name."""
@@ -67,21 +68,36 @@ class ModuleProgress:
     seconds: float | None = None
 
 
+LAYOUTS = ("dense", "blocks")
+"""How the rows of grids may be laid out, `grid.layout`; each has decoders of its own."""
+
 Report = Callable[[ModuleProgress], None]
 
 
-def module_names(target: str) -> list[str]:
-    """Warp modules of a run on ``target`` "cpu" or "cuda", those that take longest to compile first."""
-    return [f"warpslam.decoder_{target}", *(f"warpslam.{stage}" for stage in _STAGES)]
+def module_names(target: str, layouts: Sequence[str] = LAYOUTS) -> list[str]:
+    """Warp modules of runs on ``target`` "cpu" or "cuda" by the layout of their grids, those that take longest to
+    compile first.
+    """
+    return [*(decoder_module(target, layout) for layout in layouts), *(f"warpslam.{stage}" for stage in _STAGES)]
 
 
-def compile_kernels(device: wp.Device, report: Report | None = None, extra: Sequence[str] = ()) -> list[ModuleProgress]:
+def decoder_module(target: str, layout: str) -> str:
+    """Warp module of the decoders for "cpu" or "cuda", and rows "dense" or in "blocks"; a run needs that of its layout
+    alone.
+    """
+    return f"warpslam.decoder_{target}" + ("" if layout == "dense" else f"_{layout}")
+
+
+def compile_kernels(
+    device: wp.Device, report: Report | None = None, extra: Sequence[str] = (), layouts: Sequence[str] = LAYOUTS
+) -> list[ModuleProgress]:
     """Load every module of a run for ``device``, compiling those that the kernel cache does not hold.
 
     Args:
         device: Device of the run.
         report: Called before and after each module; never by two threads at a time.
         extra: Names of more modules to load.
+        layouts: Of grids: a run has one.
 
     Returns:
         One entry a module, as they were finished.
@@ -92,7 +108,7 @@ def compile_kernels(device: wp.Device, report: Report | None = None, extra: Sequ
         # Not Module.load, whose default is the block size of CUDA: a CPU launch would compile everything once more.
         wp.force_load(device, [module], max_workers=0)
 
-    names = [*module_names(target), *extra]
+    names = [*module_names(target, layouts), *extra]
     return _each(names, target, load, report, 1 if device.is_cuda else min(len(process_cores()), _WORKERS))
 
 

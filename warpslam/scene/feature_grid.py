@@ -24,6 +24,10 @@ class GridState:
     """float32 (rows, 32)."""
     seen: np.ndarray
     """uint8 (rows,)."""
+    blocks: np.ndarray | None = None
+    """Of a `BlockGrid`: which blocks were made, in their order, int64 (n, 3) in units of blocks of the world lattice,
+    whose rows are above. None: dense.
+    """
 
 
 class FeatureGrid:
@@ -31,7 +35,7 @@ class FeatureGrid:
 
     first: World lattice index of vertex 0, int64 (3,).
     shape: Vertices per axis.
-    features: Array of `Vec32`, one row a vertex (`warpslam.kernels.grid.row_of`).
+    features: Array of `Vec32`, one row a vertex (`warpslam.kernels.grid.row_of`), and room for more.
     seen: 1 where a mapped frame has measured what is at a vertex, uint8 (rows,): of the colour level, which tracking
         goes by (`RayBatch.drop_unseen`), and of the middle one, where `warpslam.mapping.depth_start` started it.
     """
@@ -46,15 +50,34 @@ class FeatureGrid:
 
     @property
     def row_count(self) -> int:
-        """Vertices of the grid."""
+        """Rows in use."""
         return int(np.prod(self.shape))
+
+    @property
+    def own_rows(self) -> int:
+        """Rows that belong to one vertex each: the last ones of those in use."""
+        return self.row_count - self.lattice.shared
+
+    @property
+    def capacity(self) -> int:
+        """Rows that there is room for."""
+        return self.row_count
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the features and of what leads to them."""
+        return 128 * self.row_count
+
+    def rows_of(self, vertices: np.ndarray) -> np.ndarray:
+        """Mask of the rows, bool (rows,), of some vertices of the box, bool (vertices,); a shared row is nobody's."""
+        return vertices
 
     def cover(self, low: np.ndarray, high: np.ndarray) -> bool:
         """Grow to hold every vertex of the cells between ``low`` and ``high`` [m]; features stay. True if it grew."""
         first = np.floor(low / self.spacing + 1e-6).astype(np.int64)
         last = np.ceil(high / self.spacing - 1e-6).astype(np.int64)
         last = np.maximum(last, first + 1)
-        if self.row_count:
+        if any(self.shape):
             first = np.minimum(first, self.first)
             last = np.maximum(last, self.first + self.shape - 1)
         nx, ny, nz = (int(n) for n in last - first + 1)
@@ -63,6 +86,10 @@ class FeatureGrid:
             return False
         self._resize(first, shape)
         return True
+
+    def bytes_over(self, low: np.ndarray, high: np.ndarray, arrays: int) -> float:
+        """Memory of the grid grown to a box [m], with ``arrays`` arrays of a row's size in all."""
+        return float(np.prod((high - low) / self.spacing + 2)) * 128 * arrays
 
     def _resize(self, first: np.ndarray, shape: tuple[int, int, int]) -> None:
         old, old_seen = Level(), self.seen

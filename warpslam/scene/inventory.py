@@ -37,7 +37,7 @@ def take_inventory(
         views: The same, with the poses that the frames have by now.
 
     Returns:
-        levels: Of each grid the spacing [m], vertices per axis and bytes of its features.
+        levels: Of each grid the spacing [m], vertices per axis of its box, and bytes of its features.
         bounds_m: Lower and upper corner of the map.
         observed_volume_m3: See `observed_volume`.
         keyframes: ``frames`` (numbers as `Slam.step` counts) and ``overlaps``, see `keyframe_overlaps`.
@@ -46,7 +46,7 @@ def take_inventory(
     observed = observed_volume(views)
     return {
         "levels": {
-            level: {"spacing_m": grid.spacing, "shape": list(grid.shape), "bytes": grid.features.capacity}
+            level: {"spacing_m": grid.spacing, "shape": list(grid.shape), "bytes": grid.bytes}
             for level, grid in scene.grids.items()
         },
         "bounds_m": np.stack(scene.bounds),
@@ -122,7 +122,7 @@ def memory_report(
         image_slot_bytes: Images on the device, which come and go.
         state_bytes_per_observed_m3: None where nothing was observed.
     """
-    grids = sum(grid.row_count * 32 * 4 for grid in scene.grids.values())
+    grids = sum(grid.bytes for grid in scene.grids.values())
     keyframes = images.compact_bytes
     views = sum(one.millimetres.nbytes for one in seen)
     total = grids + keyframes + views

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,23 @@ class Keyframe:
     """T_world_camera, float64 (4, 4), refined by bundle adjustment."""
     motion: FrameMotion = NO_MOTION
     """How the camera moved meanwhile: its image is rectified by it when it is brought, anew if this has changed."""
+
+
+@dataclass(frozen=True)
+class PlacedImage:
+    """An image and where it was taken."""
+
+    slot: int
+    """Of the image."""
+    T_world_camera: np.ndarray
+    """Its pose (4, 4)."""
+    name: Hashable = None
+    """What the image is known by again; None: it is another one each time."""
+
+
+def placed(keyframes: Sequence[Keyframe], slots: Sequence[int]) -> list[PlacedImage]:
+    """Keyframes whose images are in these slots."""
+    return [PlacedImage(slot, one.pose, (one.image, one.motion)) for one, slot in zip(keyframes, slots, strict=True)]
 
 
 def overlap_fractions(

@@ -69,8 +69,8 @@ class GridOptimizer(RowOptimizer):
     """Adam on the selected vertices of one feature grid."""
 
     def begin(self, grid: FeatureGrid, selected: np.ndarray) -> None:
-        """``selected``: bool (rows,), from frustum selection."""
-        self.start(grid.row_count, np.flatnonzero(selected))
+        """``selected``: bool (rows,), from frustum selection; False for rows that are shared."""
+        self.start(grid.capacity, np.flatnonzero(selected))
         self.selected = wp.array(selected.astype(np.uint8), dtype=wp.uint8, device=self.device)
         place = np.where(selected, np.arange(grid.row_count), -1)
         self._place = wp.array(place.astype(np.int32), dtype=int, device=self.device)
@@ -81,7 +81,16 @@ class GridOptimizer(RowOptimizer):
 
 
 class ColorDecoderOptimizer(RowOptimizer):
-    """Adam on all weights of the colour decoder, B included; keeps the transposed rows in line."""
+    """Adam on all weights of the colour decoder, B included; keeps the transposed rows in line.
+
+    Args:
+        launcher: Of the iterations that use it.
+        layout: Of the map's grids: the decoder kernels of a run are those of its layout alone.
+    """
+
+    def __init__(self, launcher: Launcher, layout: str) -> None:
+        super().__init__(launcher)
+        self.layout = layout
 
     def begin(self) -> None:
         """Start a call: all rows change."""
@@ -103,7 +112,7 @@ class ColorDecoderOptimizer(RowOptimizer):
     def update_decoder(self, packed: PackedDecoder, learning_rate: float) -> None:
         """One step on the packed weights."""
         self.update(packed.weights, learning_rate)
-        weights, transposed, kernels = packed.weights, packed.transposed, decoders_for(self.device)
+        weights, transposed, kernels = packed.weights, packed.transposed, decoders_for(self.device, self.layout)
         if kernels.by_sample:
             dim = (transposed.shape[0], 32)
             self.launcher.launch(kernels.transpose_color_entries, dim, [entries(weights), entries(transposed)])

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
 
+from warpslam.camera import Intrinsics
 from warpslam.config import GridConfig
 from warpslam.errors import InputError, MapSizeError
 from warpslam.field.arrays import FieldArrays
@@ -15,12 +17,16 @@ from warpslam.field.decoders import LEVELS, Decoders
 from warpslam.field.packing import PackedDecoder
 from warpslam.field.passes import query
 from warpslam.field.ray_batch import RayBatch
+from warpslam.kernels.blocks import Reach
+from warpslam.kernels.grid import BLOCK_ROWS
 from warpslam.poses import MAX_DISTANCE, as_numbers
 from warpslam.runtime.cores import slice_count
 from warpslam.runtime.environment import free_gigabytes
 from warpslam.runtime.exclusive import ObjectLock, exclusive
 from warpslam.runtime.phases import phase
+from warpslam.scene.block_grid import BlockGrid
 from warpslam.scene.feature_grid import FeatureGrid, GridState
+from warpslam.scene.keyframes import PlacedImage
 
 QUERY_CHUNK = 1 << 16
 _log = logging.getLogger(__name__)
@@ -48,16 +54,13 @@ class SceneMap:
 
     def __init__(self, decoders: Decoders, config: GridConfig, device: wp.Device, seed: int = 0) -> None:
         self.config, self.device, self.decoder_weights, self.seed = config, device, decoders, seed
-        self.grids = {
-            level: FeatureGrid(
-                level, getattr(config, f"{level}_spacing"), getattr(config, f"{level}_std"), seed, device
-            )
-            for level in LEVELS
-        }
+        self.grids = {level: new_grid(level, config, seed, device) for level in LEVELS}
         self.decoders = {weights.level: PackedDecoder(weights, device) for weights in decoders}
         self.low = np.zeros(3)
         self.high = np.zeros(3)
         self._buffers = 1
+        # A second look would find nothing more, unless the box has grown.
+        self._with_rows: dict[Hashable, tuple] = {}
         self._queries: RayBatch | None = None
         self.lock = ObjectLock(outlives_fork=not device.is_cuda)
 
@@ -94,13 +97,14 @@ class SceneMap:
     def restore(self, state: SceneState) -> None:
         """Put back what `state` was; the decoders are those that the map was made with."""
         self.low, self.high = state.low.copy(), state.high.copy()
+        self._with_rows.clear()
         for level, grid in self.grids.items():
             grid.restore(state.grids[level])
 
     @property
     def is_empty(self) -> bool:
         """Whether no frame has been mapped yet."""
-        return not self.grids["middle"].row_count
+        return not any(self.grids["middle"].shape)
 
     @phase("growth")
     def cover(self, low: np.ndarray, high: np.ndarray) -> bool:
@@ -113,6 +117,7 @@ class SceneMap:
             return False
         low, high = self._grown(low, high)
         self.low, self.high = low, high
+        self._with_rows.clear()
         for level, grid in self.grids.items():
             # One more coarse cell around, so that the forecast reaches beyond what was seen.
             extra = grid.spacing if level == "coarse" else 0.0
@@ -136,13 +141,18 @@ class SceneMap:
         if not self.is_empty:
             low, high = np.minimum(low, self.low), np.maximum(high, self.high)
         needed = self.gigabytes(low, high)
+        more = needed - (0.0 if self.is_empty else self.gigabytes(self.low, self.high))
+        self._check_size(low, high, needed, more)
+        return low, high
+
+    def _check_size(self, low: np.ndarray, high: np.ndarray, needed: float, more: float) -> None:
+        """Whether so many gigabytes may be taken in all, and so many more can be."""
         if needed > self.config.max_gigabytes:
             raise MapSizeError(
                 f"the map would grow to {np.round(high - low, 1).tolist()} m and {needed:.1f} GB, beyond "
                 f"grid.max_gigabytes = {self.config.max_gigabytes}: raise it, lower grid.max_depth "
                 f"(now {self.config.max_depth} m), or check the depth scale"
             )
-        more = needed - (0.0 if self.is_empty else self.gigabytes(self.low, self.high))
         free = free_gigabytes(self.device)
         if free is not None and more > free:
             raise MapSizeError(
@@ -150,13 +160,63 @@ class SceneMap:
                 f"{self.device} has {free:.1f} GB free: lower grid.max_depth (now {self.config.max_depth} m), or check "
                 "the depth scale"
             )
-        return low, high
 
     def gigabytes(self, low: np.ndarray, high: np.ndarray) -> float:
-        """Memory of the grids over a box, with both Adam moments and the gradient buffers [GB]."""
-        arrays = 2 + self._buffers + slice_count(self.device)
-        rows = sum(float(np.prod((high - low) / grid.spacing + 2)) for grid in self.grids.values())
-        return rows * 32 * 4 * arrays / 1e9
+        """Memory of the grids over a box, with both Adam moments and the gradient buffers [GB]; of levels in blocks,
+        that of the blocks that were made.
+        """
+        return sum(grid.bytes_over(low, high, self._arrays) for grid in self.grids.values()) / 1e9
+
+    @property
+    def _arrays(self) -> int:
+        """Arrays of a row's size that a row takes, at most."""
+        return 2 + self._buffers + slice_count(self.device)
+
+    @property
+    def layout(self) -> str:
+        """Of rows: "dense", or in "blocks", which `make_room` makes."""
+        return self.config.layout
+
+    @phase("growth")
+    def make_room(
+        self,
+        images: tuple[wp.array, wp.array, wp.array],
+        views: Sequence[PlacedImage],
+        camera: Intrinsics,
+        reach: Reach,
+        around: float = 0.0,
+    ) -> None:
+        """Have rows for every vertex that a sample of some images touches; dense levels have them.
+
+        Args:
+            images: Colour, depth and scale of images in slots.
+            views: Which, and where they were taken.
+            camera: Intrinsics.
+            reach: How far rays are followed.
+            around: Vertices so near to a camera get a row, too [m].
+
+        Raises:
+            MapSizeError: As `cover` does.
+        """
+        for view in views:
+            known = view.T_world_camera.tobytes(), reach.behind, reach.missing, around
+            if view.name is not None and self._with_rows.get(view.name) == known:
+                continue
+            for grid in self.grids.values():
+                if isinstance(grid, BlockGrid):
+                    blocks = grid.wanted_blocks(images, view.slot, view.T_world_camera, camera, reach)
+                    self._make(grid, blocks)
+                    if around > 0:
+                        center = view.T_world_camera[:3, 3]
+                        self._make(grid, grid.wanted_in_box(center - around, center + around))
+            if view.name is not None:
+                self._with_rows[view.name] = known
+
+    def _make(self, grid: BlockGrid, blocks: np.ndarray) -> None:
+        if len(blocks):
+            more = len(blocks) * BLOCK_ROWS * 128 * self._arrays / 1e9
+            self._check_size(self.low, self.high, self.gigabytes(self.low, self.high) + more, more)
+            grid.make(blocks)
 
     def arrays(self) -> FieldArrays:
         """What the kernels read, as it is now."""
@@ -207,3 +267,15 @@ class SceneMap:
             return np.zeros((0, 3) if stage == "color" else 0, np.float32)
         result = np.concatenate(parts)
         return np.clip(result, 0.0, 1.0) if stage == "color" else result
+
+
+def new_grid(level: str, config: GridConfig, seed: int, device: wp.Device) -> FeatureGrid:
+    """An empty grid of a level. The coarse one is dense: it forecasts what was not seen, and has few vertices."""
+    spacing, std = getattr(config, f"{level}_spacing"), getattr(config, f"{level}_std")
+    kind = BlockGrid if is_in_blocks(level, config) else FeatureGrid
+    return kind(level, spacing, std, seed, device)
+
+
+def is_in_blocks(level: str, config: GridConfig) -> bool:
+    """Whether a level has rows only where something was seen."""
+    return config.layout == "blocks" and level != "coarse"

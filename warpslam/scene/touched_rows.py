@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warpslam.field.arrays import GridGradient, entries, struct
+from warpslam.field.arrays import GridGradient, entries, lazy_zeros, struct
 from warpslam.kernels import touched_rows
 from warpslam.kernels.decoder.build import decoders_for
-from warpslam.kernels.grid import Vec32
 from warpslam.kernels.touched_rows import HELD, RowState, Touched
 from warpslam.runtime.cores import slice_count
 from warpslam.runtime.launching import Launcher, Step
@@ -51,9 +50,16 @@ class TouchedRows:
 
     def fit(self, grid: FeatureGrid) -> None:
         """Grow to the size of the grid."""
+        old_moments, old_updates, old_shape, old_lattice = self.moments, self.updates, self._shape, self._lattice
+        if grid.lattice.shared:
+            # Rows of blocks stay where they are.
+            if grid.capacity != old_updates.shape[0]:
+                self._allocate(grid)
+                wp.copy(self.moments, old_moments, count=min(old_moments.size, self.moments.size))
+                wp.copy(self.updates, old_updates, count=min(old_updates.size, self.updates.size))
+            return
         if grid.shape == self._shape and (grid.first == self._first).all():
             return
-        old_moments, old_updates, old_shape, old_lattice = self.moments, self.updates, self._shape, self._lattice
         shift = wp.vec3i(*(int(n) for n in self._first - grid.first))
         self._first, self._shape, self._lattice = grid.first.copy(), grid.shape, grid.lattice
         self._allocate(grid)
@@ -62,8 +68,8 @@ class TouchedRows:
             self.launcher.launch(touched_rows.move_rows, old_shape, inputs)
 
     def _allocate(self, grid: FeatureGrid) -> None:
-        rows, device = grid.row_count, self.device
-        self.moments = _lazy_zeros((rows, 2), device)
+        rows, device = grid.capacity, self.device
+        self.moments = lazy_zeros((rows, 2), device)
         self.updates = wp.zeros(rows, dtype=int, device=device)
         self._changed = wp.zeros(rows, dtype=wp.uint8, device=device)
         size = max(min(self.capacity, rows), 1)
@@ -73,14 +79,17 @@ class TouchedRows:
             rows=wp.zeros(size, dtype=int, device=device),
             place=wp.full(rows, -1, dtype=int, device=device),
         )
-        self._gradient = _lazy_zeros((slice_count(device), size), device)
+        self._gradient = lazy_zeros((slice_count(device), size), device)
 
     def begin(self) -> None:
         """Start a call: no row has changed."""
         if self._held is None:
             self._changed.zero_()
         else:
-            self._changed.assign(self._held)
+            # Rows that are newer are held, too.
+            held = np.full(self._changed.shape[0], HELD.value, np.uint8)
+            held[: len(self._held)] = self._held
+            self._changed.assign(held)
         self._rejected.zero_()
 
     def hold(self, held: np.ndarray | None) -> None:
@@ -137,10 +146,3 @@ class TouchedRows:
         updates[state.rows], moments[state.rows] = state.updates, state.moments
         self.updates.assign(updates)
         self.moments.assign(moments)
-
-
-def _lazy_zeros(shape: tuple[int, int], device: wp.Device) -> wp.array:
-    """Zeros of `Vec32`; on the CPU memory is taken where it is written to first, and most rows never are."""
-    if device.is_cuda or not all(shape):
-        return wp.zeros(shape, dtype=Vec32, device=device)
-    return wp.array(np.zeros((*shape, 32), np.float32), dtype=Vec32, device=device, copy=False)

@@ -172,8 +172,10 @@ class Tracker:
     def _uses(self, batch: RayBatch, arrays: FieldArrays) -> tuple:
         """What a recorded iteration stands on."""
         features = (arrays.features[level] for level in ("middle", "fine", "color"))
+        lattices = (arrays.lattices[level] for level in ("middle", "fine", "color"))
         weights = (arrays.decoders[level].weights for level in ("middle", "fine", "color"))
-        return (batch, batch.seeds, self._poses.poses, arrays.seen, *features, *weights, *arrays.low, *arrays.high)
+        grids = (arrays.seen, *features, *lattices, *weights, *arrays.low, *arrays.high)
+        return (batch, batch.seeds, self._poses.poses, *grids)
 
     def _ray_seed(self, frame: int, iteration: int) -> int:
         return ray_seed(self.seed, 1, frame, iteration)

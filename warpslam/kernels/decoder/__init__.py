@@ -27,6 +27,6 @@ As in the released code the middle feature that enters the fine decoder carries 
 On CUDA, where thousands of samples are worked on at once, they would queue for the same rows of a gradient: each stores
 its own, and `scatter_features` and `color_weights` sum them.
 
-The kernels are built twice, for the CPU and for CUDA, from one source: `build.decoder_kernels`. All parts end in one
-Warp module a target, so that they compile together.
+The kernels are built for the CPU and for CUDA, for dense rows and for rows in blocks, from one source:
+`build.decoder_kernels`. All parts end in one Warp module each, so that they compile together.
 """

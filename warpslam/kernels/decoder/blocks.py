@@ -9,23 +9,12 @@ from typing import Any
 
 import warp as wp
 
+from warpslam.kernels import dense, grid
 from warpslam.kernels.compositing import Listed
 from warpslam.kernels.decoder.embedding import angles, sine_cosine
 from warpslam.kernels.decoder.layout import BLOCK_SIZE, E0_T, E3_T, B, RowGradient, Weights
 from warpslam.kernels.decoder.native import add_scaled, dot_row, native_matvec, put_row
-from warpslam.kernels.grid import (
-    Cell,
-    Level,
-    Vec32,
-    corner_weight,
-    dot32,
-    find_cell,
-    interpolate,
-    interpolate_adjoint_features,
-    interpolate_adjoint_point,
-    row_of,
-    sum32,
-)
+from warpslam.kernels.grid import Cell, Vec32, corner_weight, dot32, sum32
 from warpslam.kernels.samples import Rays, Span, sample_index, sample_point
 
 
@@ -33,6 +22,8 @@ class Build(SimpleNamespace):
     """What the kernels for one target are made of.
 
     size: Samples of a block.
+    layout: How the rows of grids are laid out, "dense" or "blocks".
+    grid: Python module with the lattice, its levels and their lookup.
     on_cpu: Whether this is the CPU, whose compiler wants constant trip counts; CUDA's wants rolled loops.
     module: Name of the Warp module.
     Block, Positions, Scalars, Indices: Types of ``size`` rows of 32 and of 3 numbers, and of one number a sample.
@@ -40,12 +31,13 @@ class Build(SimpleNamespace):
     The functions that `block_functions` and `sample_functions` add are attributes, too.
     """
 
-    def __init__(self, target: str) -> None:
+    def __init__(self, target: str, layout: str) -> None:
         size = BLOCK_SIZE[target]
         super().__init__(
             size=size,
             on_cpu=target == "cpu",
-            module=f"warpslam.decoder_{target}",
+            grid=dense if layout == "dense" else grid,
+            module=f"warpslam.decoder_{target}" + ("" if layout == "dense" else f"_{layout}"),
             Block=wp.types.matrix(shape=(size, 32), dtype=wp.float32),
             Positions=wp.types.matrix(shape=(size, 3), dtype=wp.float32),
             Scalars=wp.types.vector(length=size, dtype=wp.float32),
@@ -56,6 +48,7 @@ class Build(SimpleNamespace):
         options = {"enable_backward": False, "max_unroll": 4, "cpu_compiler_flags": flags, "block_dim": 32}
         wp.get_module(self.module).options.update(options)
         block_functions(self)
+        quad_functions(self)
         sample_functions(self)
 
     def kernel(self, function: Callable) -> wp.Kernel:
@@ -194,11 +187,52 @@ def block_functions(build: Build) -> None:
         return r
 
 
+def quad_functions(build: Build) -> None:
+    """Lookups for CUDA."""
+    func, Level, row_of = build.func, build.grid.Level, build.grid.row_of
+
+    @func
+    def interpolate_quads(level: Level, cell: Cell) -> Vec32:
+        """`interpolate` for CUDA."""
+        c = Vec32()
+        for di in range(2):
+            for dj in range(2):
+                for dk in range(2):
+                    row = row_of(level.lattice, cell.corner[0] + di, cell.corner[1] + dj, cell.corner[2] + dk)
+                    c = add_scaled(c, corner_weight(cell.offset, di, dj, dk), level.features, row)
+        return c
+
+    @func
+    def interpolate_adjoint_point_quads(level: Level, cell: Cell, dc: Vec32) -> wp.vec3:
+        """`interpolate_adjoint_point` for CUDA: a product a corner takes fewer registers than a vector an axis."""
+        f = cell.offset
+        du = wp.vec3()
+        for di in range(2):
+            for dj in range(2):
+                for dk in range(2):
+                    row = row_of(level.lattice, cell.corner[0] + di, cell.corner[1] + dj, cell.corner[2] + dk)
+                    s = dot_row(dc, level.features, row)
+                    wx = wp.where(di == 1, f[0], 1.0 - f[0])
+                    wy = wp.where(dj == 1, f[1], 1.0 - f[1])
+                    wz = wp.where(dk == 1, f[2], 1.0 - f[2])
+                    du += s * wp.vec3(
+                        wp.where(di == 1, wy * wz, -wy * wz),
+                        wp.where(dj == 1, wx * wz, -wx * wz),
+                        wp.where(dk == 1, wx * wy, -wx * wy),
+                    )
+        return wp.cw_mul(wp.cw_mul(du, cell.free), level.lattice.inverse_spacing)
+
+
 def sample_functions(build: Build) -> None:
     """Which samples a thread works on, where they lie, and what their positions get and give."""
     size, func = build.size, build.func
     Block, Scalars, Indices, Positions = build.Block, build.Scalars, build.Indices, build.Positions
     on_cpu, angle_adjoint = build.on_cpu, build.angle_adjoint
+    Level, find_cell, interpolate = build.grid.Level, build.grid.find_cell, build.grid.interpolate
+    interpolate_adjoint_point = build.grid.interpolate_adjoint_point
+    interpolate_adjoint_features = build.grid.interpolate_adjoint_features
+    interpolate_quads = build.interpolate_quads
+    interpolate_adjoint_point_quads = build.interpolate_adjoint_point_quads
 
     @func
     def block_samples(thread: int, span: Span, sample_count: int) -> Indices:
@@ -328,36 +362,3 @@ def sample_functions(build: Build) -> None:
                 d[p] += wp.vec3(sum32(along_x[p]), sum32(along_y[p]), sum32(along_z[p]))
             if wanted[p] != 0:
                 point_grad[samples[p]] = point_grad[samples[p]] + wp.vec3(d[p, 0], d[p, 1], d[p, 2])
-
-
-@wp.func
-def interpolate_quads(level: Level, cell: Cell) -> Vec32:
-    """`interpolate` for CUDA."""
-    c = Vec32()
-    for di in range(2):
-        for dj in range(2):
-            for dk in range(2):
-                row = row_of(level.lattice, cell.corner[0] + di, cell.corner[1] + dj, cell.corner[2] + dk)
-                c = add_scaled(c, corner_weight(cell.offset, di, dj, dk), level.features, row)
-    return c
-
-
-@wp.func
-def interpolate_adjoint_point_quads(level: Level, cell: Cell, dc: Vec32) -> wp.vec3:
-    """`interpolate_adjoint_point` for CUDA, where a product a corner takes fewer registers than a vector an axis."""
-    f = cell.offset
-    du = wp.vec3()
-    for di in range(2):
-        for dj in range(2):
-            for dk in range(2):
-                row = row_of(level.lattice, cell.corner[0] + di, cell.corner[1] + dj, cell.corner[2] + dk)
-                s = dot_row(dc, level.features, row)
-                wx = wp.where(di == 1, f[0], 1.0 - f[0])
-                wy = wp.where(dj == 1, f[1], 1.0 - f[1])
-                wz = wp.where(dk == 1, f[2], 1.0 - f[2])
-                du += s * wp.vec3(
-                    wp.where(di == 1, wy * wz, -wy * wz),
-                    wp.where(dj == 1, wx * wz, -wx * wz),
-                    wp.where(dk == 1, wx * wy, -wx * wy),
-                )
-    return wp.cw_mul(wp.cw_mul(du, cell.free), level.lattice.inverse_spacing)

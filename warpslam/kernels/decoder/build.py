@@ -1,4 +1,4 @@
-"""The kernels of all decoders, built for the CPU and for CUDA."""
+"""The kernels of all decoders, built for the CPU and for CUDA, for dense rows and for rows in blocks."""
 
 from types import SimpleNamespace
 
@@ -12,13 +12,14 @@ from warpslam.kernels.decoder.layout import GROUP_SIZE, WEIGHT_GROUP, WEIGHT_SLO
 from warpslam.kernels.decoder.scatter import scatter_kernels
 
 
-def decoder_kernels(target: str) -> SimpleNamespace:
-    """Kernels of all decoders for ``target`` "cpu" or "cuda", in the Warp module ``warpslam.decoder_<target>``.
+def decoder_kernels(target: str, layout: str = "dense") -> SimpleNamespace:
+    """Kernels of all decoders for ``target`` "cpu" or "cuda" and rows "dense" or in "blocks", in the Warp module
+    ``warpslam.decoder_<target>`` or ``warpslam.decoder_<target>_blocks``.
 
     A launch over N samples has `thread_count(N)` threads and takes N as `Span.point_count`; one over a list of up to N
     samples has as many.
     """
-    build = Build(target)
+    build = Build(target, layout)
     more = {} if build.on_cpu else scatter_kernels(build)
     return SimpleNamespace(
         **geometry_kernels(build),
@@ -39,10 +40,11 @@ def decoder_kernels(target: str) -> SimpleNamespace:
     )
 
 
-CPU = decoder_kernels("cpu")
-CUDA = decoder_kernels("cuda")
+KERNELS = {
+    (target, layout): decoder_kernels(target, layout) for target in ("cpu", "cuda") for layout in ("dense", "blocks")
+}
 
 
-def decoders_for(device: wp.Device) -> SimpleNamespace:
-    """The decoder kernels built for this kind of device."""
-    return CUDA if device.is_cuda else CPU
+def decoders_for(device: wp.Device, layout: str = "dense") -> SimpleNamespace:
+    """The decoder kernels built for this kind of device and layout; those that read no grid are alike in both."""
+    return KERNELS["cuda" if device.is_cuda else "cpu", layout]

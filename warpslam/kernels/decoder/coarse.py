@@ -16,13 +16,12 @@ from warpslam.kernels.decoder.layout import (
     RowGradient,
     Weights,
 )
-from warpslam.kernels.grid import Level
 from warpslam.kernels.samples import Rays, Span
 
 
 def coarse_kernels(build: Build) -> dict[str, wp.Kernel]:
     """Kernels by name."""
-    size, Block = build.size, build.Block
+    size, Block, Level = build.size, build.Block, build.grid.Level
     block_samples, positions_of, look_up = build.block_samples, build.positions_of, build.look_up
     any_lit, output_of, outer, fill = build.any_lit, build.output_of, build.outer, build.fill
     listed_samples, wanted_of, wanted_gradient = build.listed_samples, build.wanted_of, build.wanted_gradient

@@ -22,12 +22,13 @@ from warpslam.kernels.decoder.layout import (
     Weights,
 )
 from warpslam.kernels.decoder.native import add_scaled_column, entry, put_row
-from warpslam.kernels.grid import Level, Vec32
+from warpslam.kernels.grid import Vec32
 from warpslam.kernels.samples import Rays, sample_point
 
 
 def color_kernels(build: Build) -> dict[str, wp.Kernel]:
     """Kernels by name."""
+    Level = build.grid.Level
     size, on_cpu = build.size, build.on_cpu
     Block, Scalars, Indices = build.Block, build.Scalars, build.Indices
     positions_of, look_up, listed_samples = build.positions_of, build.look_up, build.listed_samples

@@ -6,13 +6,12 @@ from warpslam.kernels.compositing import Listed, listed_count
 from warpslam.kernels.decoder.blocks import Build
 from warpslam.kernels.decoder.layers import backward_layers, forward_layers
 from warpslam.kernels.decoder.layout import OUT_32, OUT_64, RowGradient, WeightGradient, Weights
-from warpslam.kernels.grid import Level
 from warpslam.kernels.samples import Rays, Span
 
 
 def geometry_kernels(build: Build) -> dict[str, wp.Kernel]:
     """Kernels by name."""
-    size = build.size
+    size, Level = build.size, build.grid.Level
     Block, Scalars, Indices = build.Block, build.Scalars, build.Indices
     block_samples, positions_of, look_up = build.block_samples, build.positions_of, build.look_up
     any_lit, output_of, outer = build.any_lit, build.output_of, build.outer

@@ -11,7 +11,7 @@ import warp as wp
 from warpslam.kernels.compositing import Listed, listed_count
 from warpslam.kernels.decoder.blocks import Build
 from warpslam.kernels.decoder.layout import RUN, RowGradient
-from warpslam.kernels.grid import Lattice, corner_weight, find_cell, row_of
+from warpslam.kernels.grid import corner_weight
 from warpslam.kernels.samples import Rays, sample_point
 
 Vec8 = wp.types.vector(length=8, dtype=wp.float32)
@@ -19,6 +19,7 @@ Vec8 = wp.types.vector(length=8, dtype=wp.float32)
 
 def scatter_kernels(build: Build) -> dict[str, wp.Kernel]:
     """Kernels by name."""
+    Lattice, find_cell, row_of = build.grid.Lattice, build.grid.find_cell, build.grid.row_of
 
     @build.func
     def flush(grid: RowGradient, lattice: Lattice, corner: wp.vec3i, channel: int, total: Vec8):
