@@ -82,7 +82,7 @@ def test_refuses_to_grow_beyond_what_is_free(monkeypatch):
     before = scene.bounds[1].copy()
     monkeypatch.setattr("warpslam.scene.scene_map.free_gigabytes", lambda device: 0.01)
     with pytest.raises(MapSizeError, match=r"needs \d\.\d GB more, and cpu has 0.0 GB free"):
-        scene.cover(np.zeros(3), np.full(3, 20.0))
+        scene.cover(np.zeros(3), np.full(3, 8.0))
     np.testing.assert_array_equal(scene.bounds[1], before)
     monkeypatch.setattr("warpslam.scene.scene_map.free_gigabytes", lambda device: None)
     assert scene.cover(np.zeros(3), np.full(3, 2.0))

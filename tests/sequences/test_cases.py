@@ -263,7 +263,7 @@ def test_a_scene_is_as_large_as_it_is(tmp_path, factor, with_poses, severity):
     scale = float(override.split("=")[1])
     assert factor / 2 < scale < factor * 4
     config = Config.from_preset("default", [override]).resolved()
-    assert config.grid.fine_spacing == pytest.approx(0.16 * scale) and config.scene_scale == 1
+    assert config.grid.fine_spacing == pytest.approx(0.08 * scale) and config.scene_scale == 1
     no_complaints(check_folder(folder, max_depth=config.grid.max_depth))
 
 

@@ -91,7 +91,8 @@ def test_an_unknown_step_is_refused(tmp_path):
 @pytest.fixture(scope="module")
 def engine():
     """A run over three small frames, and its last frame."""
-    slam = new_slam("mapping.every=1", "keyframes.every=1", "mapping.first_iterations=5", "mapping.iterations=4")
+    small = "mapping.every=1", "keyframes.every=1", "mapping.first_iterations=5", "mapping.iterations=4"
+    slam = new_slam(*small, preset="rendering")
     sequence = SyntheticSequence(1, 8, intrinsics=slam.intrinsics)
     for n in range(3):
         frame = sequence[n]

@@ -470,13 +470,16 @@ def kernels(device: str, repeats: int = 10) -> Figures:
     settings = ["mapping.every=1", "keyframes.every=2", "mapping.first_iterations=200"]
     if SMALL:
         settings += ["tracking.ignore_edge_u=5", "tracking.ignore_edge_v=5"]
-    engine = _slam_over(camera, frames, "replica", settings, device)
+    by_rendering = [*settings, "tracking.optimizer=gauss_newton"]
+    engine = _slam_over(camera, frames, "rendering", by_rendering, device)
     tracker, mapper = engine.tracker, engine.mapper
+    direct = _slam_over(camera, frames[:4], "default", settings, device)
     result: Figures = {}
     for name, part, kind in (
         ("tracking iteration", tracker, "optimize"),
         ("judging a pose", tracker, "judge"),
         *((f"mapping iteration, {stage}", mapper, stage) for stage in ("middle", "fine", "color", "coarse")),
+        ("mapping iteration, direct loss", direct.mapper, "direct"),
     ):
         if kind not in part._launcher._kinds:
             result[name] = f"no record of {kind}"
