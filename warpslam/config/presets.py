@@ -31,16 +31,17 @@ def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, A
 
 
 _PAPER_GRID = {"fine_spacing": 0.16, "color_spacing": 0.16}
+_BY_RENDERING: dict[str, Any] = {
+    "grid": _PAPER_GRID,
+    "mapping": {**_RENDERING, "first_iterations": 500},
+    "meshing": {"level_set": -0.1},
+}
 _TUM_GRID = {"middle_spacing": 0.16, "fine_spacing": 0.08, "color_spacing": 0.08}
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "live": {"mapping": {"every": 1, "iterations": 3}},
-    "thorough": {"mapping": {"every": 1, "iterations": 15, "refinement_rounds": 6}},
-    "rendering": {
-        "grid": _PAPER_GRID,
-        "mapping": {**_RENDERING, "first_iterations": 500},
-        "meshing": {"level_set": -0.1},
-    },
+    "thorough": {"mapping": {"every": 1, "refinement_rounds": 6}},
+    "rendering": _BY_RENDERING,
     "replica": {"tracking": {"ignore_edge_u": 100, "ignore_edge_v": 100}},
     "scannet": {},
     "apartment": {},
@@ -62,9 +63,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         grid=_TUM_GRID,
     ),
     "paper_imap": {
-        "grid": _PAPER_GRID,
-        "mapping": {**_RENDERING, "first_iterations": 500},
-        "meshing": {"level_set": -0.1},
+        **_BY_RENDERING,
         "sensor_timing": False,
         "published_images": True,
         "sampling": {"jitter": False},

@@ -1,6 +1,7 @@
 """Settings: validated groups with units, presets per dataset, yaml in and out.
 
-Defaults are the published ones for Replica (released code; paper A.6) where nothing else is said.
+Defaults are ours where a description names another value of the paper, and else the published ones for Replica
+(released code; paper A.6).
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ class GridConfig(_Group):
 
     coarse_spacing: float = Field(2.0, gt=0, description="vertex spacing of the coarse level [m]")
     middle_spacing: float = Field(0.32, gt=0, description="vertex spacing of the middle level [m]")
-    fine_spacing: float = Field(0.08, gt=0, description="vertex spacing of the fine level [m]")
-    color_spacing: float = Field(0.08, gt=0, description="vertex spacing of the colour grid [m]")
+    fine_spacing: float = Field(0.08, gt=0, description="vertex spacing of the fine level [m]; the paper has 0.16")
+    color_spacing: float = Field(0.08, gt=0, description="vertex spacing of the colour grid [m]; the paper has 0.16")
     coarse_std: float = Field(0.01, ge=0, description="standard deviation of the initial coarse features")
     middle_std: float = Field(0.01, ge=0, description="standard deviation of the initial middle features")
     fine_std: float = Field(0.0001, ge=0, description="standard deviation of the initial fine features")
@@ -41,7 +42,8 @@ class GridConfig(_Group):
     layout: Literal["dense", "blocks"] = Field(
         "dense",
         description="rows of the middle, fine and colour level: one for every vertex of the map's box; or in blocks of "
-        "4 x 4 x 4 vertices where something was seen, so that memory follows that; same results with the direct loss",
+        "4 x 4 x 4 vertices where something was seen, so that memory follows that; same results until "
+        "the final refinement with the direct loss",
     )
     margin: float = Field(0.6, gt=0, description="the map reaches this far beyond what was seen [m]")
     max_depth: float = Field(10.0, gt=0, description="measurements beyond this do not count [m]")

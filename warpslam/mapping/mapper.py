@@ -14,7 +14,7 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.config import MappingConfig, SamplingConfig
-from warpslam.field.arrays import Gradients, Thresholds
+from warpslam.field.arrays import Gradients
 from warpslam.field.decoders import LEVELS
 from warpslam.field.objectives import choose_inliers, mapping_loss
 from warpslam.field.passes import render
@@ -24,6 +24,7 @@ from warpslam.mapping.active_sampling import CellErrors
 from warpslam.mapping.coarse import optimize_coarse
 from warpslam.mapping.depth_start import DepthStart
 from warpslam.mapping.frustum import mark_seen, select_in_frustum
+from warpslam.mapping.rays import draw_rays
 from warpslam.mapping.window import overlapping_window, random_window
 from warpslam.poses import pose_from_vector, vector_from_pose
 from warpslam.runtime.launching import Launcher
@@ -335,18 +336,20 @@ class Mapper:
             inliers_move=config.bundle_adjustment_filter > 0,
             color_weights=self._decoder.gradient if train_decoder else None,
         )
-        sampling = self.sampling
-        active = self._errors.active if self._errors is not None else None
         with self._launcher.tape() as tape:
-            batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera, active=active)
-            batch.cast(self._poses.poses, differentiate=gradients.points)
-            batch.bound(arrays)
-            current = slots.shape[0] - 1
-            if config.moved_margin > 0 and current > 0:
-                batch.drop_contradicted(images.arrays, current, T_world_camera, self.camera, config.moved_margin)
-            batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)
-            scale = 1.0 / batch.count if config.loss_reduction == "mean" else 1.0
-            thresholds = Thresholds(sampling.min_weight, sampling.min_gradient * scale, sampling.min_transmittance)
+            scale, thresholds = draw_rays(
+                batch,
+                arrays,
+                images,
+                slots,
+                self._poses.poses,
+                T_world_camera,
+                self.camera,
+                config,
+                self.sampling,
+                self._errors,
+                differentiate=gradients.points,
+            )
             render(batch, arrays, stage, gradients, tape, thresholds=thresholds)
             if gradients.points and gradients.inliers_move:
                 choose_inliers(batch, config.bundle_adjustment_filter, normalized=False)

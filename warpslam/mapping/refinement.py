@@ -15,13 +15,14 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.config import Config
-from warpslam.field.arrays import Gradients, Thresholds
+from warpslam.field.arrays import Gradients
 from warpslam.field.objectives import mapping_loss
 from warpslam.field.passes import render
 from warpslam.field.ray_batch import RayBatch
 from warpslam.field.seeds import ray_seed
 from warpslam.mapping.active_sampling import CellErrors
 from warpslam.mapping.coarse import optimize_coarse
+from warpslam.mapping.rays import draw_rays
 from warpslam.mapping.window import keyframes_in_turn
 from warpslam.poses import vector_from_pose
 from warpslam.runtime.launching import Launcher
@@ -141,19 +142,12 @@ class Refinement:
 
     def _iterate(self, images: ImagePool, slots: wp.array, poses: wp.array, pose: np.ndarray) -> None:
         """One iteration; nothing in it may depend on its number, because it is replayed."""
-        config, sampling, batch, arrays = self.config, self.sampling, self._batch, self.scene.arrays()
+        config, batch, arrays = self.config, self._batch, self.scene.arrays()
         gradients = Gradients(grids={level: rows.wanted() for level, rows in self.rows.items()})
-        current = slots.shape[0] - 1
         with self._launcher.tape() as tape:
-            active = self._errors.active if self._errors is not None else None
-            batch.draw(images.arrays, slots, max(config.pixels // slots.shape[0], 1), self.camera, active=active)
-            batch.cast(poses, differentiate=False)
-            batch.bound(arrays)
-            if config.moved_margin > 0 and current > 0:
-                batch.drop_contradicted(images.arrays, current, pose, self.camera, config.moved_margin)
-            batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)
-            scale = 1.0 / batch.count if config.loss_reduction == "mean" else 1.0
-            thresholds = Thresholds(sampling.min_weight, sampling.min_gradient * scale, sampling.min_transmittance)
+            scale, thresholds = draw_rays(
+                batch, arrays, images, slots, poses, pose, self.camera, config, self.sampling, self._errors
+            )
             render(batch, arrays, "color", gradients, tape, thresholds=thresholds)
             mapping_loss(batch, config.color_weight * scale, scale)
         self._launcher.call(partial(tape.backward, batch.loss))
