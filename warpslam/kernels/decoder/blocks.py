@@ -82,19 +82,7 @@ def block_functions(build: Build) -> None:
             r[p] += d[p] * row
         return r
 
-    if on_cpu:
-
-        @func
-        def matvec(r: Block, x: Block, W: wp.array[Vec32], row: int) -> Block:
-            """r + sum_k x[:, k] W[row + k]."""
-            s = Block(r)
-            for k in range(32):
-                w = W[row + k]
-                for p in range(size):
-                    s[p] += x[p, k] * w
-            return s
-    else:
-        build.matvec = native_matvec(Block)
+    matvec = build.matvec = native_matvec(Block, on_cpu=on_cpu)
 
     @func
     def relu(a: Block) -> Block:
@@ -171,8 +159,6 @@ def block_functions(build: Build) -> None:
             for i in range(32):
                 e[p, i] = sine_cosine(a[i])[0]
         return e
-
-    matvec = build.matvec
 
     @func
     def angle_adjoint(positions: Positions, decoder: Weights, chunk: int, a0: Block, a3: Block) -> Block:
