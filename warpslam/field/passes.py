@@ -386,5 +386,4 @@ def _weight_gradient(batch: RayBatch, rows: wp.array | None) -> WeightGradient:
         rows=batch.no_rows if rows is None else rows,
         activations=batch.activations,
         layer_grad=batch.layer_grad,
-        layer_inputs=batch.layer_inputs,
     )

@@ -99,7 +99,6 @@ class RayBatch:
         self.no_errors = wp.zeros((1, 1), dtype=float, device=device)
         self.no_rows, self.no_places = empty, wp.zeros(1, dtype=int, device=device)
         self.activations = self.layer_grad = self.feature_grad = empty
-        self.layer_inputs = wp.zeros((1, 1, 1), dtype=float, device=device)
         self.motion: MotionArrays | None = None
 
     def make_room_for_feature_gradients(self) -> None:
@@ -117,9 +116,7 @@ class RayBatch:
                 self.layer_grad = wp.empty((size, layout.STORED_COLUMNS), dtype=Vec32, device=self.device)
             else:
                 shape = (layout.WEIGHT_GROUP * slice_count(self.device), layout.WEIGHT_GROUP_COLUMNS)
-                self.layer_inputs = wp.zeros((*shape, 32), dtype=float, device=self.device)
-                pointer = self.layer_inputs.ptr
-                self.layer_grad = wp.array(ptr=pointer, dtype=Vec32, shape=shape, device=self.device)
+                self.layer_grad = wp.zeros(shape, dtype=Vec32, device=self.device)
 
     # -- as the kernels take them ---------------------------------------------------------------------------------
 

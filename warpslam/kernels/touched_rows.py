@@ -18,6 +18,8 @@ from warpslam.kernels.supervision import MODULE
 
 HELD = wp.constant(wp.uint8(2))
 """Of `RowState.changed`: a row that may not change."""
+AHEAD = wp.constant(8)
+"""Rows between the one that is updated and the one that is fetched (CPU)."""
 BETA = wp.constant(0.99)
 LOG_BETA_1 = wp.constant(-0.105360515657826)
 LOG_BETA_2 = wp.constant(-0.010050335853501)
@@ -94,6 +96,22 @@ def bias_scale(updates: int) -> wp.vec2:
     return wp.vec2(1.0 / (1.0 - wp.exp(t * LOG_BETA_1)), 1.0 / (1.0 - wp.exp(t * LOG_BETA_2)))
 
 
+@wp.func_native("""
+#if !defined(__CUDA_ARCH__)
+    const char* m = (const char*)(state.moments.data + 2 * row);
+    const char* v = (const char*)(x.data + row);
+    for (int line = 0; line < 4; ++line) __builtin_prefetch(m + 64 * line, 1);
+    for (int line = 0; line < 2; ++line) __builtin_prefetch(v + 64 * line, 1);
+    __builtin_prefetch(state.updates.data + row, 1);
+    __builtin_prefetch(state.changed.data + row, 1);
+    __builtin_prefetch(touched.place.data + row, 1);
+#endif
+""")
+def prefetch(touched: Touched, state: RowState, x: wp.array[Vec32], row: int):
+    """Begin to bring to the cache what the update of a row reads (CPU)."""
+    ...
+
+
 @wp.kernel(module=MODULE)
 def adam_touched(
     part: int,
@@ -106,7 +124,10 @@ def adam_touched(
     rejected: wp.array[int],
 ):
     """One of ``parts`` threads (CPU): every so manieth row of the list. Clears gradients and places."""
-    for n in range(part, touched.count[0], parts):
+    count = touched.count[0]
+    for n in range(part, count, parts):
+        # Rows lie anywhere in memory, and waiting for them one after the other takes longer than the arithmetic.
+        prefetch(touched, state, x, touched.rows[wp.min(n + AHEAD * parts, count - 1)])
         row = touched.rows[n]
         touched.place[row] = -1
         g = grad[0, n]

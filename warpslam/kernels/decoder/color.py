@@ -21,7 +21,7 @@ from warpslam.kernels.decoder.layout import (
     WeightGradient,
     Weights,
 )
-from warpslam.kernels.decoder.native import add_scaled_column, entry, put_row
+from warpslam.kernels.decoder.native import add_outer, add_scaled_column, entry, put_row
 from warpslam.kernels.grid import Vec32
 from warpslam.kernels.samples import Rays, sample_point
 
@@ -64,25 +64,9 @@ def color_kernels(build: Build) -> dict[str, wp.Kernel]:
             color[samples[p]] = wp.vec3(red[p] + bias[0], green[p] + bias[1], blue[p] + bias[2])
 
     @build.func
-    def add_outer(weights: WeightGradient, slot: int, row: int, x: int, d: int):
+    def add_product(weights: WeightGradient, slot: int, row: int, x: int, d: int):
         """rows[row + k] += sum over a slice's group of x[k] d, both columns of what its samples stored (CPU)."""
-        first = WEIGHT_GROUP * slot
-        # Four rows at a time share what is read of d.
-        for k in range(8):
-            r0 = Vec32()
-            r1 = Vec32()
-            r2 = Vec32()
-            r3 = Vec32()
-            for q in range(WEIGHT_GROUP):
-                g = weights.layer_grad[first + q, d]
-                r0 += weights.layer_inputs[first + q, x, 4 * k] * g
-                r1 += weights.layer_inputs[first + q, x, 4 * k + 1] * g
-                r2 += weights.layer_inputs[first + q, x, 4 * k + 2] * g
-                r3 += weights.layer_inputs[first + q, x, 4 * k + 3] * g
-            weights.rows[slot, row + 4 * k] = weights.rows[slot, row + 4 * k] + r0
-            weights.rows[slot, row + 4 * k + 1] = weights.rows[slot, row + 4 * k + 1] + r1
-            weights.rows[slot, row + 4 * k + 2] = weights.rows[slot, row + 4 * k + 2] + r2
-            weights.rows[slot, row + 4 * k + 3] = weights.rows[slot, row + 4 * k + 3] + r3
+        add_outer(weights.rows, slot, row, weights.layer_grad, WEIGHT_GROUP * slot, WEIGHT_GROUP, x, d)
 
     @build.func
     def color_block_backward(
@@ -202,12 +186,12 @@ def color_kernels(build: Build) -> dict[str, wp.Kernel]:
         if wp.static(on_cpu):
             if weights.wanted != 0:
                 for layer in range(4):
-                    add_outer(weights, listed.slot, W1 + 32 * layer, 14 + layer, 1 + layer)
+                    add_product(weights, listed.slot, W1 + 32 * layer, 14 + layer, 1 + layer)
                 for layer in range(5):
-                    add_outer(weights, listed.slot, V + 32 * layer, 13, 5 + layer)
+                    add_product(weights, listed.slot, V + 32 * layer, 13, 5 + layer)
                 for chunk in range(3):
-                    add_outer(weights, listed.slot, E0 + 32 * chunk, 10 + chunk, 0)
-                    add_outer(weights, listed.slot, E3 + 32 * chunk, 10 + chunk, 3)
+                    add_product(weights, listed.slot, E0 + 32 * chunk, 10 + chunk, 0)
+                    add_product(weights, listed.slot, E3 + 32 * chunk, 10 + chunk, 3)
 
     @build.kernel
     def color_weights(listed: Listed, rays: Rays, color_grad: wp.array[wp.vec3], weights: WeightGradient):

@@ -108,11 +108,9 @@ class WeightGradient:
         that a row of it is fetched once a group and not once a block. On CUDA thousands of threads would queue for the
         same rows: all samples store `STORED_COLUMNS`, a_0..a_4, g_0..g_4, the gradients of the angles (3), the feature
         and the embedding (3), and `color_weights` sums.
-    layer_inputs: The same memory, one number an element (CPU).
     """
 
     wanted: int
     rows: wp.array2d[Vec32]
     activations: wp.array2d[Vec32]
     layer_grad: wp.array2d[Vec32]
-    layer_inputs: wp.array3d[float]

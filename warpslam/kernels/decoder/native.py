@@ -79,6 +79,42 @@ _MATVEC_CPU = """
     return s;
 """
 
+# The same tiles, of four rows of the result.
+_ADD_OUTER = """
+#ifdef __AVX512F__
+    constexpr int lanes = 16;
+#else
+    constexpr int lanes = 8;
+#endif
+    typedef float vector __attribute__((vector_size(4 * lanes), aligned(4)));
+    const int stride = 32 * columns.shape[1];
+    const float* left = (const float*)columns.data + first * stride + 32 * x;
+    const float* right = (const float*)columns.data + first * stride + 32 * d;
+    float* sum = (float*)(rows.data + slot * rows.shape[1] + row);
+    for (int k = 0; k < 32; k += 4) {
+        for (int i = 0; i < 32; i += 2 * lanes) {
+            vector t[4][2] = {};
+            #pragma unroll 1
+            for (int q = 0; q < count; ++q) {
+                const vector d_0 = *(const vector*)(right + q * stride + i);
+                const vector d_1 = *(const vector*)(right + q * stride + i + lanes);
+                #pragma unroll
+                for (int n = 0; n < 4; ++n) {
+                    const float x_k = left[q * stride + k + n];
+                    t[n][0] += x_k * d_0;
+                    t[n][1] += x_k * d_1;
+                }
+            }
+            #pragma unroll
+            for (int n = 0; n < 4; ++n)
+                for (int j = 0; j < 2; ++j) {
+                    vector* place = (vector*)(sum + 32 * (k + n) + i + j * lanes);
+                    *place = *place + t[n][j];
+                }
+        }
+    }
+"""
+
 _ADD_SCALED = """
     struct alignas(16) quad { float a, b, c, d; };
     wp::vec_t<32, wp::float32> t = r;
@@ -133,6 +169,14 @@ def native_matvec(Block: type, *, on_cpu: bool) -> Any:
     def matvec(r: Block, x: Block, W: wp.array[Vec32], row: int) -> Block: ...
 
     return matvec
+
+
+@wp.func_native(_ADD_OUTER)
+def add_outer(
+    rows: wp.array2d[Vec32], slot: int, row: int, columns: wp.array2d[Vec32], first: int, count: int, x: int, d: int
+):
+    """rows[slot, row + k] += sum over q < count of columns[first + q, x][k] columns[first + q, d] (CPU)."""
+    ...
 
 
 @wp.func_native(_ADD_SCALED.replace("AT", "row"))
