@@ -113,26 +113,39 @@ def visible_points(
             ``tolerance`` behind the depth of its pixel; without it, wherever it projects into the image.
         tolerance: Accepted distance behind the depth [m]; negative: it must lie that far in front of it.
     """
-    points = np.asarray(points, dtype=np.float64)
-    seen = np.zeros(len(points), dtype=bool)
+    import warp as wp
+
+    from warpslam.kernels.raycast import mark_seen_points
+    from warpslam.runtime.launching import Launcher, Step
+
+    device = wp.get_device("cpu")
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    seen = np.zeros(len(points), dtype=np.uint8)
+    given, marks = (wp.array(a, dtype=t, device=device, copy=False) for a, t in ((points, wp.vec3d), (seen, wp.uint8)))
+    k, launcher = intrinsics, Launcher(device)
     depth_images = iter(depths) if depths is not None else None
     for T_world_camera in np.asarray(poses, dtype=np.float64):
-        depth = next(depth_images) if depth_images is not None else None
+        depth = np.zeros((0, 0)) if depth_images is None else next(depth_images)
         if not np.isfinite(T_world_camera).all():
             continue
-        # Only points not seen so far are projected: after a few views these are a fraction.
-        rest = np.flatnonzero(~seen)
-        R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
-        x, y, z = ((points[rest] - t) @ R).T
-        in_front = z > 1e-6
-        rest, x, y, z = rest[in_front], x[in_front], y[in_front], z[in_front]
-        column, row = map(np.rint, intrinsics.project(x, y, z))
-        inside = (column >= 0) & (column < intrinsics.width) & (row >= 0) & (row < intrinsics.height)
-        if depth is not None:
-            surface = depth[row[inside].astype(int), column[inside].astype(int)]
-            inside[inside] = (surface > 0) & (z[inside] <= surface + tolerance)
-        seen[rest[inside]] = True
-    return seen
+        inputs = [
+            given,
+            wp.mat33d(*T_world_camera[:3, :3].ravel()),
+            wp.vec3d(*T_world_camera[:3, 3]),
+            wp.vec2d(k.fx, k.fy),
+            wp.vec2d(k.cx, k.cy),
+            k.width,
+            k.height,
+            wp.array(np.ascontiguousarray(depth, np.float32), dtype=wp.float32, device=device, copy=False),
+            wp.float64(tolerance),
+            marks,
+        ]
+
+        def steps(first: int, stop: int, slot: int, inputs: list = inputs) -> list[Step]:
+            return [(mark_seen_points, stop - first, [first, *inputs])]
+
+        launcher.slices(len(points), steps)
+    return seen.astype(bool)
 
 
 def sample_surface(

@@ -52,6 +52,7 @@ class TexturedMesh:
 
 @wp.kernel
 def render_mesh(
+    first: int,
     scene: TexturedMesh,
     focal: wp.vec2,
     center: wp.vec2,
@@ -61,8 +62,9 @@ def render_mesh(
     rgb: wp.array2d[wp.vec3ub],  # (H, W)
     depth: wp.array2d[wp.float32],  # (H, W) [m], 0 = miss
 ):
-    """Cast the ray of one pixel and write its colour and z-depth."""
+    """Cast the ray of one pixel, of the rows from ``first`` on, and write its colour and z-depth."""
     j, i = wp.tid()
+    j += first
     ray = wp.vec3((float(i) - center[0]) / focal[0], (float(j) - center[1]) / focal[1], 1.0)
     length = wp.length(ray)
     query = wp.mesh_query_ray(scene.mesh, origin, rotation * (ray / length), max_depth * length)
@@ -95,3 +97,38 @@ def render_mesh(
         wp.uint8(wp.clamp(color[1] + 0.5, 0.0, 255.0)),
         wp.uint8(wp.clamp(color[2] + 0.5, 0.0, 255.0)),
     )
+
+
+@wp.kernel
+def mark_seen_points(
+    first: int,
+    points: wp.array[wp.vec3d],
+    rotation: wp.mat33d,  # camera to world
+    origin: wp.vec3d,
+    focal: wp.vec2d,
+    center: wp.vec2d,
+    width: int,
+    height: int,
+    depth: wp.array2d[wp.float32],  # (H, W) [m], 0 = missing; empty: whatever is in the image is seen
+    tolerance: wp.float64,
+    seen: wp.array[wp.uint8],
+):
+    """Mark a point, of those from ``first`` on, that lies no more than ``tolerance`` behind the depth of its pixel."""
+    tid = first + wp.tid()
+    if seen[tid] != wp.uint8(0):
+        return
+    p = wp.transpose(rotation) * (points[tid] - origin)
+    if not (p[2] > wp.float64(1.0e-6)):
+        return
+    u = wp.rint(focal[0] * p[0] / p[2] + center[0])
+    v = wp.rint(focal[1] * p[1] / p[2] + center[1])
+    # Not what is left where none is outside: a NaN is not inside either.
+    if not (
+        u >= wp.float64(0.0) and u < wp.float64(width) and v >= wp.float64(0.0) and v < wp.float64(height)
+    ):
+        return
+    if depth.shape[0] > 0:
+        surface = depth[int(v), int(u)]
+        if not (surface > 0.0 and p[2] <= wp.float64(surface) + tolerance):
+            return
+    seen[tid] = wp.uint8(1)

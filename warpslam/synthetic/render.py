@@ -14,6 +14,7 @@ from warpslam.camera import Intrinsics
 from warpslam.errors import ConfigError, MeshError
 from warpslam.poses import check_transform
 from warpslam.runtime.environment import named_device
+from warpslam.runtime.launching import Launcher, Step
 
 if TYPE_CHECKING:
     import trimesh
@@ -176,21 +177,21 @@ class MeshRenderer:
 
         T = check_transform(T_world_camera)
         k = self.intrinsics
-        wp.launch(
-            render_mesh,
-            dim=(k.height, k.width),
-            inputs=[
-                self._surface,
-                wp.vec2(k.fx, k.fy),
-                wp.vec2(k.cx, k.cy),
-                wp.mat33(*T[:3, :3].ravel().tolist()),
-                wp.vec3(*T[:3, 3].tolist()),
-                self.max_depth,
-            ],
-            outputs=[self._rgb, self._depth],
-            device=self._device,
-            record_tape=False,
-        )
+        inputs = [
+            self._surface,
+            wp.vec2(k.fx, k.fy),
+            wp.vec2(k.cx, k.cy),
+            wp.mat33(*T[:3, :3].ravel().tolist()),
+            wp.vec3(*T[:3, 3].tolist()),
+            self.max_depth,
+            self._rgb,
+            self._depth,
+        ]
+
+        def steps(first: int, stop: int, slot: int) -> list[Step]:
+            return [(render_mesh, (stop - first, k.width), [first, *inputs])]
+
+        Launcher(self._device).slices(k.height, steps)
         return self._rgb.numpy().copy(), self._depth.numpy().copy()
 
 
