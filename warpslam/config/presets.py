@@ -19,7 +19,7 @@ def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, A
         **groups.pop("mapping", {}),
     }  # fmt: skip
     return {
-        "sampling": {"jitter": False},
+        "sampling": {"jitter": False, "min_occupancy": 0.0},
         "tracking": {**_PAPER, **(tracking or {})},
         "mapping": mapping,
         "keyframes": {"every": 50},
@@ -66,7 +66,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         **_BY_RENDERING,
         "sensor_timing": False,
         "published_images": True,
-        "sampling": {"jitter": False},
+        "sampling": {"jitter": False, "min_occupancy": 0.0},
         "keyframes": {"every": 50},
         "tracking": {"final_rate_factor": 1.0},
         "imap": {

@@ -72,6 +72,9 @@ class SamplingConfig(_Group):
         le=0.01,
         description="a ray ends where less light is left (0 = exact): its depth errs below this x its largest depth",
     )
+    min_occupancy: float = Field(
+        0.005, ge=0, le=0.1, description="pictures leave out samples where the map has no more than this (0 = exact)"
+    )
 
 
 class TrackingConfig(_Group):

@@ -24,10 +24,11 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.field.arrays import FieldArrays, camera_struct, projection, struct
-from warpslam.kernels import adam, by_sample, compositing, pixels, rays, rejection, samples
+from warpslam.kernels import adam, by_sample, compositing, free_space, pixels, rays, rejection, samples
 from warpslam.kernels.compositing import Rendered
 from warpslam.kernels.decoder import layout
 from warpslam.kernels.decoder.build import decoders_for
+from warpslam.kernels.free_space import Looks
 from warpslam.kernels.grid import Vec32
 from warpslam.kernels.pixels import Draw, ErrorCells, Images, Pixels
 from warpslam.kernels.samples import Placement, Rays
@@ -255,6 +256,32 @@ class RayBatch:
             return [(samples.place_samples, stop - first, [first, *inputs])]
 
         self.launcher.slices(self.count, steps)
+
+    def look(self, arrays: FieldArrays, limit: float, looks: Looks) -> None:
+        """Note of the cells of the fine level whether the logit of a sample in them is beyond ``limit``."""
+        inputs = [arrays.lattices["fine"], self.rays, self.keep, self.logit, limit, looks]
+
+        def steps(first: int, stop: int, slot: int) -> list[Step]:
+            return [(free_space.look, stop - first, [first, *inputs])]
+
+        self.launcher.slices(self.count, steps)
+
+    def leave_out_free(self, arrays: FieldArrays, looks: Looks) -> None:
+        """Samples alone that are not in free space, so many a ray as the ray with most of them has."""
+        inputs = [arrays.lattices["fine"], self.rays, self.keep, looks]
+
+        def count(first: int, stop: int, slot: int) -> list[Step]:
+            return [(free_space.count_wanted, stop - first, [first, *inputs, self.inlier])]
+
+        self.launcher.slices(self.count, count)
+        width = int(self.inlier.numpy()[: self.count].max())
+        z = wp.empty_like(self.z)
+
+        def take(first: int, stop: int, slot: int) -> list[Step]:
+            return [(free_space.take_wanted, stop - first, [first, *inputs, width, z])]
+
+        self.launcher.slices(self.count, take)
+        self.z, self.sample_count = z, width
 
 
 def image_struct(images: tuple[wp.array, wp.array, wp.array]) -> Images:

@@ -123,9 +123,7 @@ def mark_seen_points(
     u = wp.rint(focal[0] * p[0] / p[2] + center[0])
     v = wp.rint(focal[1] * p[1] / p[2] + center[1])
     # Not what is left where none is outside: a NaN is not inside either.
-    if not (
-        u >= wp.float64(0.0) and u < wp.float64(width) and v >= wp.float64(0.0) and v < wp.float64(height)
-    ):
+    if not (u >= wp.float64(0.0) and u < wp.float64(width) and v >= wp.float64(0.0) and v < wp.float64(height)):
         return
     if depth.shape[0] > 0:
         surface = depth[int(v), int(u)]
