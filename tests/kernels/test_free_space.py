@@ -106,9 +106,8 @@ def test_pictures_stay_what_they_are(layout):
         points[limit] = sum(row.points for row in profile.report.kernels if row.kernel == "fine_forward")
     exact, fast = views.values()
     assert psnr(fast.rgb, (255 * exact.rgb).round().astype(np.uint8)) > 35
-    # The little that free space absorbs draws the mean depth to the camera.
+    # The little that free space absorbs draws the mean depth of a young map to the camera.
     assert np.median(np.abs(fast.depth - exact.depth)) < 0.01
     assert np.mean(np.abs(fast.depth - exact.depth) > 0.1) < 0.01
-    errors = [np.median(np.abs(view.depth - frames[2].depth)) for view in (fast, exact)]
-    assert errors[0] < errors[1] + 0.001
+    assert np.median(np.abs(fast.depth - frames[2].depth)) < 0.01
     assert 2 * points[sampling.min_occupancy] < points[0.0]
