@@ -59,7 +59,7 @@ def test_importing_one_name_loads_no_more_than_it_needs():
 def test_shipped_files():
     """Type marker, pretrained decoders and dataset cameras are in the package."""
     assert (PACKAGE / "py.typed").is_file()
-    assert (PACKAGE / "data" / "decoders.pth").stat().st_size > 100_000
+    assert (PACKAGE / "data" / "decoders.safetensors").stat().st_size > 100_000
     assert list((PACKAGE / "sequences" / "cameras").glob("*.yaml"))
 
 

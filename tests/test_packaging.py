@@ -17,7 +17,7 @@ import pytest
 from tests.conftest import REPOSITORY
 
 DATA = (
-    "py.typed", "data/decoders.pth", "bench/published.yaml", "bench/suites/quick.yaml", "report/report.css",
+    "py.typed", "data/decoders.safetensors", "bench/published.yaml", "bench/suites/quick.yaml", "report/report.css",
     "report/report.js", "report/turntable.js", "sequences/cameras/replica.yaml",
 )  # fmt: skip
 

@@ -1,13 +1,16 @@
 """Decoder weights: formats read, exact padding, and what the messages say about files that can't be used."""
 
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from warpslam.errors import CheckpointError
 from warpslam.field.decoder_files import DEFAULT_PATH, load_decoders
-from warpslam.field.decoders import LEVELS, Decoders, expected_shapes, random_decoders
+from warpslam.field.decoders import LEVELS, STATE_FORM, Decoders, expected_shapes, random_decoders
+from warpslam.storage.state_file import write_state
 
 torch = pytest.importorskip("torch")
 
@@ -251,9 +254,36 @@ def test_code_in_a_checkpoint_is_not_run(tmp_path):
 
 
 def test_default_weights_are_small_and_complete():
-    """The packaged file holds tensors only, is below 1 MB, and is as wide as the paper's decoders."""
+    """The packaged file is below 1 MB, and as wide as the paper's decoders."""
     assert DEFAULT_PATH.stat().st_size < 1_000_000
     decoders = load_decoders()
     assert isinstance(decoders, Decoders)
     assert [w.hidden for w in decoders] == [32] * 4
-    assert all(isinstance(v, torch.Tensor) for v in torch.load(DEFAULT_PATH, weights_only=True).values())
+
+
+def test_state_file(tmp_path):
+    """It holds the same numbers as a checkpoint, and any other bit is noticed."""
+    decoders, path = random_decoders(3, hidden=20), tmp_path / "decoders.safetensors"
+    decoders.save(path)
+    assert_same(load_decoders(path), decoders)
+    whole = path.read_bytes()
+    for place in range(40, len(whole), len(whole) // 40):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+        with pytest.raises(CheckpointError, match="decoders.safetensors"):
+            load_decoders(path)
+
+
+def test_package_weights_need_no_torch():
+    """Importing it takes seconds and much memory."""
+    code = "import sys; from warpslam.field.decoder_files import load_decoders as f; f(); print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_state_file_of_another_shape(tmp_path):
+    """The key and what is expected of it."""
+    state = random_decoders(3).state_dict()
+    state["fine_decoder.fc_c.0.weight"] = np.zeros((32, 7), np.float32)
+    write_state(tmp_path / "d.safetensors", STATE_FORM, {}, state)
+    with pytest.raises(CheckpointError, match="fine_decoder.fc_c.0.weight"):
+        load_decoders(tmp_path / "d.safetensors")

@@ -15,7 +15,7 @@ import numpy as np
 from tools.attacks import scene
 from tools.attacks.isolation import Attempt
 from tools.attacks.values import mutated_array, mutated_bytes, mutated_json
-from warpslam.field.decoder_files import DEFAULT_PATH, load_decoders
+from warpslam.field.decoder_files import load_decoders
 from warpslam.pipeline.checkpoints import RUN_FORMAT, read_checkpoint
 from warpslam.pipeline.observer import Observer
 from warpslam.pipeline.run import run
@@ -96,11 +96,15 @@ class _Copier(Observer):
 
 
 def _decoders(folder: Path) -> Attempt:
-    data = DEFAULT_PATH.read_bytes()
-    path = folder / "decoders.pth"
     truth = load_decoders()
+    paths = [folder / f"decoders{suffix}" for suffix in (".pth", ".safetensors")]
+    for path in paths:
+        truth.save(path)
+    whole = [path.read_bytes() for path in paths]
 
     def attempt(rng: np.random.Generator) -> str:
+        kind = int(rng.integers(0, len(paths)))
+        path, data = paths[kind], whole[kind]
         changed = bytearray(data)
         if rng.random() < 0.5:
             changed[rng.integers(0, len(data))] ^= 1 << int(rng.integers(0, 8))

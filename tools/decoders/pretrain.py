@@ -4,7 +4,7 @@
     python -m tools.decoders.pretrain average --out runs/mixed --start first.pth --other second.pth --share 0.35
     python -m tools.decoders.pretrain quiet --out runs/quiet --start runs/mixed/decoders.pth
     python -m tools.decoders.pretrain evaluate --out runs/pretraining --also other=some_decoders.pth
-    python -m tools.decoders.pretrain export --out runs/pretraining --to warpslam/data/decoders.pth
+    python -m tools.decoders.pretrain export --out runs/pretraining --to warpslam/data/decoders.safetensors
 
 `train` makes the room samples first, writes checkpoint.pt, decoders.pth, losses.png and log.txt to the folder, and
 continues from checkpoint.pt where there is one. It uses a CUDA device if torch finds one, else the CPU.

@@ -1,4 +1,6 @@
-"""Decoder weights from torch checkpoints, ours, the authors' and others' with the same names."""
+"""Decoder weights from files: torch checkpoints, ours, the authors' and others' with the same names; and state files,
+which need no torch: importing it takes seconds and 200 MB, so the package's own weights are one.
+"""
 
 from __future__ import annotations
 
@@ -19,6 +21,8 @@ from warpslam.field.decoders import (
     FEATURE_SIZE,
     LEVELS,
     MAX_HIDDEN,
+    STATE_FORM,
+    STATE_SUFFIX,
     Decoders,
     DecoderWeights,
     expected_shapes,
@@ -26,8 +30,9 @@ from warpslam.field.decoders import (
     random_decoder,
 )
 from warpslam.reading import MEGABYTE, check_regular
+from warpslam.storage.state_file import read_state
 
-DEFAULT_PATH = Path(__file__).parents[1] / "data" / "decoders.pth"
+DEFAULT_PATH = Path(__file__).parents[1] / "data" / "decoders.safetensors"
 _FILE_LIMIT = 512 * MEGABYTE
 _NESTING_KEYS = ("decoder_state_dict", "decoders", "model", "state_dict", "decoder")
 
@@ -39,11 +44,11 @@ def load_decoders(
     middle_fine: str | Path | None = None,
     color_seed: int = 0,
 ) -> Decoders:
-    """Read decoder weights from torch checkpoints.
+    """Read decoder weights from torch checkpoints, or from a state file.
 
     Args:
-        path: A state dict with the prefixes `coarse_decoder.`, `middle_decoder.`, `fine_decoder.`, `color_decoder.`
-            (hidden width at most 32, possibly nested under a key such as `model`), or a folder that holds `coarse.pt`
+        path: What `Decoders.save` wrote, or a state dict with the prefixes `coarse_decoder.`, `middle_decoder.`,
+            `fine_decoder.`, `color_decoder.` (hidden width at most 32, possibly nested under a key such as `model`), or a folder that holds `coarse.pt`
             and `middle_fine.pt`. With neither this nor the next two, the weights that come with warpslam.
         coarse: The authors' `coarse.pt`. Give `middle_fine`, too.
         middle_fine: The authors' `middle_fine.pt`.
@@ -55,7 +60,7 @@ def load_decoders(
     Raises:
         CheckpointError: A file is missing, is no checkpoint, or lacks a tensor; a shape is wrong; a weight is not
             finite.
-        MissingDependencyError: torch is not installed.
+        MissingDependencyError: The file is a torch checkpoint, and torch is not installed.
     """
     if coarse is not None or middle_fine is not None:
         if path is not None:
@@ -145,15 +150,18 @@ def _hidden_width(found: Mapping[str, Any], prefix: str, level: str, path: Path)
 
 
 def _to_array(value: Any, shape: tuple[int, ...], key: str, path: Path) -> np.ndarray:
-    torch = import_torch()
-    if not isinstance(value, torch.Tensor) or value.layout != torch.strided or value.is_quantized:
-        raise CheckpointError(f"{path}: key {key!r} is a {type(value).__name__}, expected a dense tensor {shape}.")
-    if tuple(value.shape) != shape:
+    if tuple(getattr(value, "shape", shape)) != shape:
         raise CheckpointError(
             f"{path}: key {key!r} has shape {tuple(value.shape)}, expected {shape}. The feature size must be "
             f"{FEATURE_SIZE} and the embedding size {EMBEDDING_SIZE}."
         )
-    array = value.detach().to(device="cpu", dtype=torch.float32).contiguous().numpy().copy()
+    if isinstance(value, np.ndarray) and value.dtype.kind == "f":
+        array = value.astype(np.float32)
+    else:
+        torch = import_torch()
+        if not isinstance(value, torch.Tensor) or value.layout != torch.strided or value.is_quantized:
+            raise CheckpointError(f"{path}: key {key!r} is a {type(value).__name__}, expected a dense tensor {shape}.")
+        array = value.detach().to(device="cpu", dtype=torch.float32).contiguous().numpy().copy()
     if not np.isfinite(array).all():
         bad = int((~np.isfinite(array)).sum())
         raise CheckpointError(
@@ -167,9 +175,11 @@ def _read_checkpoint(path: Path) -> Mapping[str, Any]:
     """Load a checkpoint without running code from it."""
     if not os.path.isfile(path):
         raise CheckpointError(
-            f"{path}: there is no such file. Give the path of a decoder checkpoint (.pth or .pt), or of a folder that "
-            "holds coarse.pt and middle_fine.pt."
+            f"{path}: there is no such file. Give the path of a decoder checkpoint (.pth, .pt or .safetensors), or of "
+            "a folder that holds coarse.pt and middle_fine.pt."
         )
+    if path.suffix == STATE_SUFFIX:
+        return read_state(path, STATE_FORM)[1]
     torch = import_torch()
     _check_sums(path)
     try:

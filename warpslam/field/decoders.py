@@ -9,7 +9,7 @@ and a skip connection in front of block 3. With e = sin(p . B), p in world metre
 
 The names of the tensors are those of the authors' checkpoints: `pts_linears.k` (W, b), `fc_c.k` (V, d), `embedder._B`
 (B, shape (3, 93)) and `output_linear`. All weights are NumPy arrays here; torch is imported only to read or write
-a file.
+its checkpoints.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from warpslam.errors import CheckpointError, MissingDependencyError
+from warpslam.storage.state_file import StateFormat, write_state
 
 LEVELS = ("coarse", "middle", "fine", "color")
 """Of the map; a stage of mapping is called after the last one that it optimises."""
@@ -31,6 +32,8 @@ EMBEDDING_SCALE = 25.0
 BLOCK_COUNT = 5
 SKIP_BLOCK = 3
 MAX_HIDDEN = 32
+STATE_FORM = StateFormat("warpslam-decoders", 1, "decoders that `Decoders.save` wrote")
+STATE_SUFFIX = ".safetensors"
 _OUTPUT_SIZE = {"coarse": 1, "middle": 1, "fine": 1, "color": 4}
 _CONDITION_SIZE = {"middle": FEATURE_SIZE, "fine": 2 * FEATURE_SIZE, "color": FEATURE_SIZE}
 
@@ -116,13 +119,21 @@ class Decoders:
         return {f"{w.level}_decoder.{name}": array for w in self for name, array in w.tensors.items()}
 
     def save(self, path: str | Path) -> None:
-        """Write a torch state dict that `load_decoders` and the authors' code both read.
+        """Write a torch state dict that `load_decoders` and the authors' code both read, or a state file.
 
         Args:
-            path: File to write; its folder is created.
+            path: File to write; its folder is created. One that ends in ``.safetensors`` is a state file, with a check
+                sum of all weights.
+
+        Raises:
+            CheckpointError: The state file can't be written.
+            MissingDependencyError: It is to be a torch checkpoint, and torch is not installed.
         """
-        torch = import_torch()
         path = Path(path)
+        if path.suffix == STATE_SUFFIX:
+            write_state(path, STATE_FORM, {}, self.state_dict())
+            return
+        torch = import_torch()
         path.parent.mkdir(parents=True, exist_ok=True)
         state = {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in self.state_dict().items()}
         torch.save(state, path)
