@@ -48,8 +48,9 @@ def load_decoders(
 
     Args:
         path: What `Decoders.save` wrote, or a state dict with the prefixes `coarse_decoder.`, `middle_decoder.`,
-            `fine_decoder.`, `color_decoder.` (hidden width at most 32, possibly nested under a key such as `model`), or a folder that holds `coarse.pt`
-            and `middle_fine.pt`. With neither this nor the next two, the weights that come with warpslam.
+            `fine_decoder.`, `color_decoder.` (hidden width at most 32, possibly nested under a key such as `model`),
+            or a folder that holds `coarse.pt` and `middle_fine.pt`. With neither this nor the next two, the weights
+            that come with warpslam.
         coarse: The authors' `coarse.pt`. Give `middle_fine`, too.
         middle_fine: The authors' `middle_fine.pt`.
         color_seed: Seed of the colour decoder, which the authors' files do not contain.
