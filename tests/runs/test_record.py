@@ -21,7 +21,7 @@ def pose(x: float) -> np.ndarray:
 
 def made() -> RunRecord:
     """Frames 2 to 4 of a sequence, of which 3 can't be read and 4 is skipped, without a true pose."""
-    record = RunRecord(position=5, first_index=7, digests={2: "ab"})
+    record = RunRecord(position=3, first_index=7, digests={2: "ab"})
     record.add(2, pose(1), FrameResult(7, 0.1, pose(1.5), losses={"tracking": 0.5}, timings={"tracking": 0.25}))
     record.leave_out(3, "truncated")
     unknown = np.full((4, 4), np.nan)

@@ -45,8 +45,9 @@ def test_json_and_back():
     request = RunRequest(Source("/x", "icl", "1,1,1,1,2,2,1000"), (0, None, 2), preset="replica", overrides=OVERRIDES)
     for one in (RunRequest(), request, request.resolved("default", range(3), "cpu")):
         assert RunRequest.from_dict(json.loads(json.dumps(one.to_dict()))) == one
-    with pytest.raises(TypeError):
-        RunRequest.from_dict({**request.to_dict(), "speed": 3})
+    for wrong in ({"speed": 3}, {"frames": [1]}, {"source": {"path": [3]}}, {"overrides": 5}, {"config": "fast"}):
+        with pytest.raises(ValueError, match="path" if "source" in wrong else next(iter(wrong))):
+            RunRequest.from_dict({**request.to_dict(), **wrong})
 
 
 def test_differences_name_both_values():
