@@ -10,7 +10,7 @@ import pytest
 from warpslam.config import Config
 from warpslam.errors import ConfigError
 from warpslam.runs.folder import RunFolder
-from warpslam.runs.request import RunRequest, Source, parse_slice
+from warpslam.runs.request import RunRequest, SequenceFacts, Source, parse_slice
 from warpslam.storage.json_files import write_json
 
 OVERRIDES = ("mapping.window=3",)
@@ -48,6 +48,15 @@ def test_json_and_back():
     for wrong in ({"speed": 3}, {"frames": [1]}, {"source": {"path": [3]}}, {"overrides": 5}, {"config": "fast"}):
         with pytest.raises(ValueError, match="path" if "source" in wrong else next(iter(wrong))):
             RunRequest.from_dict({**request.to_dict(), **wrong})
+
+
+def test_facts_of_a_sequence_are_of_their_kinds():
+    """As a checkpoint has them."""
+    facts = {"sequence": "a", "frame_count": 3, "intrinsics": {}, "timing": {}}
+    assert SequenceFacts.from_dict(facts) == SequenceFacts("a", 3, {}, {})
+    for wrong in ({"frame_count": "many"}, {"intrinsics": []}, {"sequence": None}, {"more": 1}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            SequenceFacts.from_dict({**facts, **wrong})
 
 
 def test_differences_name_both_values():
