@@ -34,7 +34,7 @@ _ROW_FIELDS = ("timestamp", "status", "message", "inliers", "depth_error", "corr
 _STATUSES = {str(status): status for status in FrameStatus}
 
 
-_Row6 = Annotated[list[Annotated[float, Field(ge=-1e12, le=1e12)]], Field(min_length=6, max_length=6)]
+_Row6 = Annotated[list[Annotated[float, Field(ge=-1e30, le=1e30)]], Field(min_length=6, max_length=6)]
 _Covariance = Annotated[list[_Row6], Field(min_length=6, max_length=6)]
 _FARTHEST = 1e12
 _TIMING_FIELDS = {"depth_delay", "readout", "depth_delay_sigma", "readout_sigma"}
@@ -80,7 +80,7 @@ class _Result(BaseModel, extra="forbid"):
     timings: dict[str, Seconds]
     message: str
     reference: Index | None
-    sensor_timing: dict[str, Finite]
+    sensor_timing: dict[str, float]
 
     @field_validator("sensor_timing")
     @classmethod

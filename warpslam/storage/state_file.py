@@ -32,6 +32,7 @@ _METADATA = "__metadata__"
 _KEY = "warpslam"
 _NO_DIGEST = "0" * 64
 _CHUNK = 1 << 20
+_LEAST_SHARE = 1e-14  # of the largest variance: an eigenvalue below it is none
 _LARGEST_VARIANCE = 1e15  # beside which what is added to it is lost
 
 
@@ -235,14 +236,14 @@ class StateFields:
         return value
 
     def covariances(self, name: str, count: int) -> np.ndarray:
-        """Of poses, float64 (``count``, 6, 6), symmetric, none of them negative."""
+        """Of poses, float64 (``count``, 6, 6), symmetric and invertible; rounding may have made one indefinite."""
         found = self.array(name, np.float64, (count, 6, 6))
         size = np.abs(found).max(axis=(1, 2), initial=0.0)[:, None]
         is_symmetric = (np.abs(found - found.swapaxes(1, 2)).max(axis=2, initial=0.0) <= 1e-6 * size).all()
         if size.max(initial=0.0) > _LARGEST_VARIANCE or not is_symmetric:
             raise self.damaged(name, "they are no covariances, or too large")
-        if (np.linalg.eigvalsh(found) < -1e-6 * size).any():
-            raise self.damaged(name, "they are no covariances: some variance is negative")
+        if (np.abs(np.linalg.eigvalsh(found)) <= _LEAST_SHARE * size).any():
+            raise self.damaged(name, "they are no covariances: one can't be inverted")
         return found
 
     def mapping(self, name: str) -> dict[str, Any]:
