@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from warpslam.poses import motion_between, pose_from_vector, rotation_angles, vector_from_pose
+from warpslam.tracking.direct.joint_rows import is_elsewhere, is_far
 
 COUNT = 1000
 
@@ -55,6 +56,23 @@ def test_angles_are_accurate(rotations):
     angles = rotation_angles(R)
     np.testing.assert_allclose(angles, expected, rtol=1e-12, atol=1e-15)
     assert rotation_angles(R[5]) == pytest.approx(angles[5], rel=1e-15)
+
+
+def test_poses_that_are_not_finite_are_far_apart():
+    """NaN and infinity anywhere in one of the two, alone or in a stack; the others are what they were."""
+    rng = np.random.default_rng(0)
+    poses = np.array([pose_from_vector(rng.normal(size=7)) for _ in range(6)])
+    usual = motion_between(poses[0], poses)
+    for value in (np.nan, np.inf, -np.inf):
+        for at in np.ndindex(4, 4):
+            broken = poses.copy()
+            broken[(2, *at)] = value
+            assert (motion_between(broken[2], np.eye(4)) == np.inf).all()
+            assert (motion_between(np.eye(4), broken[2]) == np.inf).all()
+            motion = motion_between(poses[0], broken)
+            assert (motion[2] == np.inf).all()
+            np.testing.assert_array_equal(np.delete(motion, 2, 0), np.delete(usual, 2, 0))
+            assert is_elsewhere(broken[2], poses[2]) and is_far(poses[2], broken[2])
 
 
 def test_motion_between_poses():

@@ -75,6 +75,16 @@ def test_only_regular_files_are_opened(make, tmp_path, monkeypatch):
         assert errors and errors[0].filename == str(path)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_what_is_no_text_is_an_error_of_the_system(tmp_path, encoding):
+    """As whoever reads a file expects them: it says where the byte is, and names the file."""
+    path = tmp_path / "file"
+    path.write_bytes(b"abc\xc5\x28")
+    with pytest.raises(OSError, match="no text in UTF-8.*0xc5 at 3") as raised:
+        read_text(path, encoding=encoding)
+    assert raised.value.filename == str(path)
+
+
 def test_sizes_are_bounded(tmp_path):
     """A file larger than what is asked for is refused before it is read; one of the very size is read."""
     path = tmp_path / "file"

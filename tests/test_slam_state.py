@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tracemalloc
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tools.attacks.values import mutated_json
 from warpslam.camera import Intrinsics, SensorTiming
 from warpslam.config import Config
 from warpslam.errors import CheckpointError, ConfigError, InputError, MapSizeError
@@ -143,6 +145,33 @@ def test_every_header_field_is_checked(state, name, value):
     if value is None:
         with pytest.raises(CheckpointError, match=name):
             state_from_arrays("map", {n: v for n, v in header.items() if n != name}, arrays)
+
+
+def test_any_header_is_a_state_or_one_error(state):
+    """Hundreds of headers with parts replaced by what does not belong there, or left out; settings have tests of their
+    own.
+    """
+    header, arrays = state
+    own = json.loads(json.dumps({name: value for name, value in header.items() if name != "config"}))
+    refused = 0
+    for seed in range(400):
+        changed = mutated_json(own, np.random.default_rng(seed))
+        try:
+            state_from_arrays("map", {**changed, "config": header["config"]}, arrays)
+        except CheckpointError as error:
+            assert str(error).startswith("map: field "), f"seed {seed}"
+            refused += 1
+    assert 200 < refused < 400
+
+
+def test_a_camera_that_sees_nowhere_is_lost_not_an_error(state, frames):
+    """A principal point far outside of the image: no pose can be found, and the joint one need not be finite."""
+    header, arrays = state
+    camera = {**header["intrinsics"], "cx": 1000 * header["intrinsics"]["cx"]}
+    slam = Slam.from_state(state_from_arrays("map", {**header, "intrinsics": camera}, arrays), "cpu")
+    for frame in frames[5:7]:
+        result = slam.step(frame.rgb, frame.depth, frame.timestamp)
+        assert result.status in ("OK", "LOST") and np.isfinite(result.T_world_camera).all()
 
 
 def test_image_that_does_not_inflate_is_refused(state):

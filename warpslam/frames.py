@@ -83,7 +83,9 @@ class FrameResult:
         """
         if self.covariance is None:
             return math.nan, math.nan
-        shift, turn = (float(np.linalg.eigvalsh(self.covariance[k : k + 3, k : k + 3])[-1]) ** 0.5 for k in (0, 3))
+        shift, turn = (
+            max(float(np.linalg.eigvalsh(self.covariance[k : k + 3, k : k + 3])[-1]), 0.0) ** 0.5 for k in (0, 3)
+        )
         return shift, math.degrees(turn)
 
 

@@ -103,8 +103,14 @@ def motion_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Distance [m] and angle [degrees] between two poses (4, 4), or of each pair of two stacks (N, 4, 4).
 
     Returns:
-        float64 (2,) or (N, 2).
+        float64 (2,) or (N, 2); infinite where one of the two is not finite, as what an optimiser makes of an absurd
+        camera may be.
     """
+    is_known = np.isfinite(a).all(axis=(-2, -1)) & np.isfinite(b).all(axis=(-2, -1))
+    if not np.all(is_known):
+        known = is_known[..., None, None]
+        motion = motion_between(np.where(known, a, np.eye(4)), np.where(known, b, np.eye(4)))
+        return np.where(is_known[..., None], motion, np.inf)
     turn = rotation_angles(np.swapaxes(a[..., :3, :3], -1, -2) @ b[..., :3, :3])
     return np.stack([np.linalg.norm(a[..., :3, 3] - b[..., :3, 3], axis=-1), np.degrees(turn)], axis=-1)
 

@@ -5,6 +5,9 @@ from __future__ import annotations
 import errno
 import os
 import stat
+import struct
+import zipfile
+import zlib
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +15,11 @@ from typing import Any
 MEGABYTE = 1 << 20
 TEXT_LIMIT = 64 * MEGABYTE
 YAML_LIMIT = MEGABYTE // 2
+ARCHIVE_ERRORS: tuple[type[Exception], ...] = (
+    ValueError, OSError, EOFError, KeyError, TypeError, AttributeError, SyntaxError, RuntimeError, OverflowError,
+    MemoryError, zipfile.BadZipFile, zlib.error, struct.error,
+)  # fmt: skip
+"""What `numpy.load` and `zipfile` raise for archives that are damaged, or no archives."""
 _KINDS = {
     stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
     stat.S_IFDIR: "a folder",
@@ -82,10 +90,13 @@ def read_text(path: str | Path, limit: float = TEXT_LIMIT, encoding: str = "utf-
     """Content of a regular file of text, with line feeds.
 
     Raises:
-        OSError: As `read_bytes`.
-        UnicodeDecodeError: It is no text.
+        OSError: As `read_bytes`, or it is no text.
     """
-    text = read_bytes(path, limit).decode(encoding)
+    try:
+        text = read_bytes(path, limit).decode(encoding)
+    except UnicodeDecodeError as error:
+        where = f"byte {error.object[error.start]:#04x} at {error.start}"
+        raise OSError(errno.EILSEQ, f"is no text in {error.encoding.upper()} ({where})", str(path)) from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 

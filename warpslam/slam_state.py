@@ -6,10 +6,11 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import warp as wp
+from pydantic import Field
 
 from warpslam.camera import FrameMotion, Intrinsics, SensorTiming
 from warpslam.config import Config, GridConfig
@@ -27,6 +28,7 @@ from warpslam.scene.keyframes import Keyframe
 from warpslam.scene.mapped_views import SEEN_STRIDE, SeenDepth
 from warpslam.scene.scene_map import SceneState, is_in_blocks
 from warpslam.scene.touched_rows import TouchedRowsState
+from warpslam.storage.json_files import Finite, Index
 from warpslam.storage.state_file import StateFields, StateFormat, read_state, write_state
 from warpslam.tracking.direct.timing import TimingState
 from warpslam.tracking.direct.tracker import DirectState
@@ -299,9 +301,7 @@ def _blocks(fields: StateFields, level: str, first: np.ndarray, shape: np.ndarra
 
 
 def _optimizer(fields: StateFields, grids: dict[str, GridState]) -> dict[str, TouchedRowsState]:
-    levels = fields.header.get("optimizer")
-    if not isinstance(levels, list) or not set(levels) <= {*LEVELS, "decoder"}:
-        raise fields.damaged("optimizer", f"{levels!r} are no levels")
+    levels = fields.names("optimizer", (*LEVELS, "decoder"))
     result = {}
     for level in levels:
         is_grid = level != "decoder"
@@ -344,26 +344,19 @@ def _direct_header(state: DirectState) -> dict[str, Any]:
 
 
 def _direct(fields: StateFields, frames: int, keyframes: int) -> DirectState | None:
-    header = fields.header.get("direct")
-    if header is None:
+    if fields.header.get("direct") is None:
         return None
+    header = fields.checked("direct", _DirectHeader)
     anchors = fields.array("direct_anchors", np.int64, (None,))
     count = len(anchors)
     if count > frames or (anchors >= keyframes).any():
         raise fields.damaged("direct_anchors", f"{count} frames of {frames}, keyframes up to {anchors.max(initial=-1)}")
-    try:
-        reference, before, confirmed = (int(header[name]) for name in ("reference", "before", "confirmed"))
-        depth_sigma = float(header["depth_sigma"])
-        scale, cost = (np.inf if header[name] is None else float(header[name]) for name in ("scale", "cost"))
-    except (KeyError, TypeError, ValueError) as error:
-        raise fields.damaged("direct", error) from None
+    reference, before, confirmed, depth_sigma = header.reference, header.before, header.confirmed, header.depth_sigma
+    scale, cost = (np.inf if value is None else value for value in (header.scale, header.cost))
     relative = fields.array("direct_relative", np.float64, (count, 4, 4)).copy()
     found = fields.array("direct_found", np.float64, (2, 4, 4)).copy()
     if not are_rigid(relative[anchors >= 0]) or (confirmed > 0 and not are_rigid(found)):
         raise fields.damaged("direct_relative or direct_found", "they are no rigid transforms of a camera")
-    learnt = (depth_sigma, scale, cost)
-    if not all(0 <= value for value in learnt) or not np.isfinite(depth_sigma) or confirmed < 0:
-        raise fields.damaged("direct", f"depth_sigma, scale and cost {learnt}, confirmed {confirmed}")
     motion = fields.array("direct_motion", np.float64, (8,)).copy()
     _motion(fields, "direct_motion", motion)
     if not (0 <= reference < max(keyframes, 1) and -1 <= before < frames):
@@ -382,60 +375,68 @@ def _direct(fields: StateFields, frames: int, keyframes: int) -> DirectState | N
     )
 
 
+@dataclass(frozen=True)
+class _DirectHeader:
+    reference: Index
+    before: Annotated[int, Field(ge=-1)]
+    confirmed: Index
+    depth_sigma: Annotated[Finite, Field(ge=0.0)]
+    scale: Annotated[Finite, Field(ge=0.0)] | None
+    cost: Annotated[Finite, Field(ge=0.0)] | None
+
+
+@dataclass(frozen=True)
+class _TimingHeader:
+    first: Index
+    since: Index
+    stamped: bool
+    stage: Index
+    is_done: bool
+
+
+@dataclass(frozen=True)
+class _LoopsHeader:
+    seen: Index
+    figures: dict[str, Finite]
+
+
 def _timing_header(state: TimingState) -> dict[str, Any]:
     return {name: value for name, value in vars(state).items() if name != "blocks"}
 
 
 def _timing_state(fields: StateFields, frames: int) -> TimingState | None:
-    header = fields.header.get("timing_estimate")
-    if header is None:
+    if fields.header.get("timing_estimate") is None:
         return None
     blocks = fields.array("timing_blocks", np.float64, (None, 6)).copy()
-    try:
-        state = TimingState(
-            blocks=blocks,
-            first=int(header["first"]),
-            since=int(header["since"]),
-            stamped=bool(header["stamped"]),
-            stage=int(header["stage"]),
-            is_done=bool(header["is_done"]),
-        )
-    except (KeyError, TypeError, ValueError) as error:
-        raise fields.damaged("timing_estimate", error) from None
+    state = TimingState(blocks=blocks, **vars(fields.checked("timing_estimate", _TimingHeader)))
     if not (0 <= state.first <= state.since and np.isfinite(blocks).all()):
         raise fields.damaged("timing_estimate", f"frames from {state.first}, those that count from {state.since}")
     return state
 
 
 def _loops(fields: StateFields, count: int, keyframes: int) -> LoopState | None:
-    header = fields.header.get("loops")
-    if header is None:
+    if fields.header.get("loops") is None:
         return None
+    header = fields.checked("loops", _LoopsHeader)
     arrays = {}
     for kind in ("tracked", "loop", "bridge"):
         pairs = fields.array(f"loops_{kind}_pairs", np.int64, (None, 2)).copy()
         if len(pairs) and (pairs.min() < 0 or pairs.max() >= keyframes or (pairs[:, 0] >= pairs[:, 1]).any()):
             raise fields.damaged(f"loops_{kind}_pairs", f"pairs of keyframes up to {pairs.max()}, of {keyframes}")
         arrays[f"{kind}_pairs"] = pairs
-        for name, size in (("transforms", 4), ("covariances", 6)):
-            array = fields.array(f"loops_{kind}_{name}", np.float64, (len(pairs), size, size)).copy()
-            if not np.isfinite(array).all():
-                raise fields.damaged(f"loops_{kind}_{name}", "a number that is not finite")
-            arrays[f"{kind}_{name}"] = array
+        arrays[f"{kind}_transforms"] = fields.poses(f"loops_{kind}_transforms", len(pairs)).copy()
+        arrays[f"{kind}_covariances"] = fields.covariances(f"loops_{kind}_covariances", len(pairs)).copy()
     made = arrays["made_frames"] = fields.array("loops_made_frames", np.int64, (None,)).copy()
     if len(made) and (made.min() < 0 or made.max() >= count or len(np.unique(made)) < len(made)):
         raise fields.damaged("loops_made_frames", f"frames up to {made.max()}, of {count}")
     arrays["made_poses"] = fields.poses("loops_made_poses", len(made)).copy()
     try:
-        seen = int(header["seen"])
-        figures = {name: float(value) for name, value in header["figures"].items()}
-        state = LoopState(arrays, seen, figures)
-        LoopFigures.of(figures)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise fields.damaged("loops", error) from None
-    if not 0 <= seen <= keyframes:
-        raise fields.damaged("loops", f"{seen} keyframes of {keyframes} were looked at")
-    return state
+        LoopFigures.of(header.figures)
+    except KeyError as error:
+        raise fields.damaged("loops.figures", f"{error} is missing") from None
+    if header.seen > keyframes:
+        raise fields.damaged("loops", f"{header.seen} keyframes of {keyframes} were looked at")
+    return LoopState(arrays, header.seen, header.figures)
 
 
 def _seen_size(camera: Intrinsics) -> tuple[int, int]:

@@ -15,11 +15,12 @@ from warpslam.storage.json_files import read_json, write_json
 def test_only_what_a_run_has_is_written(tmp_path):
     """Absent figures are left out, unknown numbers are null, NumPy values are plain; reading gives the same again."""
     metrics = RunMetrics()
-    metrics.fill({"mesh": {"faces": np.int64(3), "area_m2": float("nan")}, "fps": None, "bounds_m": np.eye(2)})
+    metrics.fill({"mesh": {"faces": np.int64(3), "area_m2": float("nan")}, "fps": None, "bounds_m": np.eye(2, 3)})
     metrics.error = "it broke"
     metrics.write(tmp_path / "metrics.json")
     expected = {
-        "fps": None, "bounds_m": [[1.0, 0.0], [0.0, 1.0]], "mesh": {"faces": 3, "area_m2": None}, "error": "it broke",
+        "fps": None, "bounds_m": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]], "mesh": {"faces": 3, "area_m2": None},
+        "error": "it broke",
     }  # fmt: skip
     assert read_json(tmp_path / "metrics.json") == expected
     assert list(read_json(tmp_path / "metrics.json")) == list(expected)

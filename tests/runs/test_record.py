@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 
+from tools.attacks.values import mutated_json
 from warpslam.frames import FrameResult
 from warpslam.runs.record import RunRecord
 from warpslam.storage.json_files import to_json
@@ -21,7 +22,7 @@ def pose(x: float) -> np.ndarray:
 
 def made() -> RunRecord:
     """Frames 2 to 4 of a sequence, of which 3 can't be read and 4 is skipped, without a true pose."""
-    record = RunRecord(position=5, first_index=7, digests={2: "ab"})
+    record = RunRecord(position=3, first_index=7, digests={2: "ab"})
     record.add(2, pose(1), FrameResult(7, 0.1, pose(1.5), losses={"tracking": 0.5}, timings={"tracking": 0.25}))
     record.leave_out(3, "truncated")
     unknown = np.full((4, 4), np.nan)
@@ -53,6 +54,59 @@ def test_a_checkpoint_gives_all_of_it_back():
     header["frame_indices"].pop()
     with pytest.raises(ValueError, match="different lengths"):
         RunRecord.from_state(header, dict(arrays))
+
+
+def test_any_header_is_a_record_or_a_value_error():
+    """Parts replaced by what does not belong there, or left out; what is accepted has the kinds that it promises."""
+    header, arrays = made().to_state()
+    header, outcomes = json.loads(json.dumps(header)), {"read": 0, "refused": 0}
+    for seed in range(1000):
+        try:
+            record = RunRecord.from_state(mutated_json(header, np.random.default_rng(seed)), dict(arrays))
+        except ValueError:
+            outcomes["refused"] += 1
+            continue
+        outcomes["read"] += 1
+        assert record.counts["processed"] == 2 and json.dumps(record.to_state()[0]) and record.losses is not None
+        assert all(type(index) is int for index in (*record.frame_indices, *record.digests, record.position))
+    assert all(outcomes.values()), outcomes
+
+
+def test_frames_outside_of_the_sequence_are_named():
+    """The frames of each list; those within are no error."""
+    record = made()
+    record.check_frames(5)
+    for name, index, count in (("frame_indices", 4, 4), ("digests", 9, 5), ("left_out", 7, 5)):
+        other = made()
+        if name == "digests":
+            other.digests[index] = "ab"
+        elif name == "left_out":
+            other.leave_out(index, "")
+        with pytest.raises(ValueError, match=f"{name}: frame {index} is none of the {count}"):
+            other.check_frames(count)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda header, arrays: header.update(position=2), lambda header, arrays: header.pop("seconds"),
+        lambda header, arrays: header["results"][0].update(sensor_timing={"readout": 1.0}),
+        lambda header, arrays: header["results"][0].update(status="FINE"),
+        lambda header, arrays: header["results"][0].update(covariance=[[1.0]]),
+        lambda header, arrays: arrays.update(run_poses=3 * arrays["run_poses"]),
+        lambda header, arrays: arrays.update(run_poses=arrays["run_poses"].reshape(-1, 16)),
+        lambda header, arrays: arrays.update(run_truth_poses=arrays["run_truth_poses"].astype(np.int64)),
+        lambda header, arrays: arrays.update(run_truth_poses=1e300 * arrays["run_truth_poses"]),
+    ],
+)  # fmt: skip
+def test_a_record_that_can_not_be_is_refused(damage):
+    """Values that contradict one another, or that nothing could be computed from."""
+    header, arrays = made().to_state()
+    header, arrays = json.loads(json.dumps(header)), dict(arrays)
+    RunRecord.from_state(header, dict(arrays))
+    damage(header, arrays)
+    with pytest.raises(ValueError):
+        RunRecord.from_state(header, arrays)
 
 
 def test_frames_json_gives_back_what_became_of_the_frames():

@@ -10,7 +10,7 @@ import pytest
 from warpslam.config import Config
 from warpslam.errors import ConfigError
 from warpslam.runs.folder import RunFolder
-from warpslam.runs.request import RunRequest, Source, parse_slice
+from warpslam.runs.request import RunRequest, SequenceFacts, Source, parse_slice
 from warpslam.storage.json_files import write_json
 
 OVERRIDES = ("mapping.window=3",)
@@ -45,8 +45,18 @@ def test_json_and_back():
     request = RunRequest(Source("/x", "icl", "1,1,1,1,2,2,1000"), (0, None, 2), preset="replica", overrides=OVERRIDES)
     for one in (RunRequest(), request, request.resolved("default", range(3), "cpu")):
         assert RunRequest.from_dict(json.loads(json.dumps(one.to_dict()))) == one
-    with pytest.raises(TypeError):
-        RunRequest.from_dict({**request.to_dict(), "speed": 3})
+    for wrong in ({"speed": 3}, {"frames": [1]}, {"source": {"path": [3]}}, {"overrides": 5}, {"config": "fast"}):
+        with pytest.raises(ValueError, match="path" if "source" in wrong else next(iter(wrong))):
+            RunRequest.from_dict({**request.to_dict(), **wrong})
+
+
+def test_facts_of_a_sequence_are_of_their_kinds():
+    """As a checkpoint has them."""
+    facts = {"sequence": "a", "frame_count": 3, "intrinsics": {}, "timing": {}}
+    assert SequenceFacts.from_dict(facts) == SequenceFacts("a", 3, {}, {})
+    for wrong in ({"frame_count": "many"}, {"intrinsics": []}, {"sequence": None}, {"more": 1}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            SequenceFacts.from_dict({**facts, **wrong})
 
 
 def test_differences_name_both_values():

@@ -65,6 +65,14 @@ def test_nothing_is_loaded_after_the_start(monkeypatch, optimizer, layout):
     assert not find_module(other).execs, "a run needs the decoders of one layout"
 
 
+def test_a_run_that_names_no_settings_loads_the_kernels_of_the_defaults(empty_cache, monkeypatch):
+    """Benchmarks and attacks leave them out."""
+    asked = []
+    monkeypatch.setattr(compilation, "module_names", lambda target, layouts=(): asked.append(layouts) or SMALL)
+    (module,) = pipeline.load_kernels(FakeSequence(), "cpu")
+    assert module.name == SMALL[0] and asked == [[Config().grid.layout]]
+
+
 def test_compiles_once_and_says_so(empty_cache):
     """The first time a module is compiled and is announced as such before; the second time it comes from the cache."""
     seen: list[ModuleProgress] = []

@@ -151,7 +151,7 @@ def _run_child(account: Account, arguments: list[str], first: int, folder: str, 
             ready = selector.select(max(limit - time.monotonic(), 0.0))
             if not ready and time.monotonic() >= limit:
                 if began and time.monotonic() < last and is_kept_waiting(process, spent, seconds):
-                    limit += 2.0
+                    limit = time.monotonic() + 2.0  # from now on: this process may have been stopped as well
                     continue
                 os.killpg(child.pid, signal.SIGKILL)
                 child.wait()

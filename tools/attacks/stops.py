@@ -144,7 +144,7 @@ class _Runs:
                 due = None
             if now > limit:
                 if now - start < _LONGEST and is_kept_waiting(process, 0.0, self.seconds + SECONDS):
-                    limit += 2.0
+                    limit = time.monotonic() + 2.0
                     continue
                 os.kill(pid, signal.SIGKILL)
                 os.waitpid(pid, 0)

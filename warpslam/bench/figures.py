@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import csv
+import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from warpslam.errors import DatasetError
 from warpslam.frames import FrameStatus
+from warpslam.reading import read_text
 from warpslam.runs.folder import RunFolder
 from warpslam.runs.metrics import RunMetrics
-from warpslam.storage.json_files import read_json
+from warpslam.runs.timing import RunTiming
 from warpslam.storage.tum import read_tum
 
 MIN_GAP = 5
@@ -25,7 +26,7 @@ def read_figures(folder: RunFolder) -> dict[str, float]:
     Raises:
         DatasetError: A file is missing or damaged.
     """
-    metrics, timing = RunMetrics.read(folder.metrics), read_json(folder.timing)
+    metrics, timing = RunMetrics.read(folder.metrics), RunTiming.read(folder.timing)
     surface = metrics.reconstruction
     figures = {
         "accuracy": _scaled(surface.accuracy_m, 100),
@@ -45,9 +46,9 @@ def _scaled(value: float | None, factor: float) -> float | None:
     return None if value is None else factor * value
 
 
-def _mean_milliseconds(timing: dict[str, Any], phase: str) -> float | None:
+def _mean_milliseconds(timing: RunTiming, phase: str) -> float | None:
     """Of the frames that have the phase, the first frame left out: it is mapped far longer than others."""
-    times = [frame[phase] for frame in timing.get("frames", [])[1:] if phase in frame]
+    times = [frame.seconds[phase] for frame in timing.frames[1:] if phase in frame.seconds]
     return 1000 * float(np.mean(times)) if times else None
 
 
@@ -88,7 +89,6 @@ def gap_figures(folder: RunFolder) -> dict[str, float]:
 
 def _statuses(path: Path) -> np.ndarray:
     try:
-        with open(path, newline="", encoding="utf-8") as file:
-            return np.array([row["status"] for row in csv.DictReader(file)])
-    except (OSError, KeyError) as error:
+        return np.array([row["status"] for row in csv.DictReader(io.StringIO(read_text(path)))])
+    except (OSError, KeyError, csv.Error) as error:
         raise DatasetError(f"{path}: can't be read as the table of a run's frames ({error}); run again") from error

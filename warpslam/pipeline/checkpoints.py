@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warpslam.config import Config
-from warpslam.errors import CheckpointError, ConfigError, DatasetError
+from warpslam.errors import CheckpointError, ConfigError, DatasetError, brief
 from warpslam.runs.folder import RunFolder
 from warpslam.runs.record import RunRecord
 from warpslam.runs.request import RunRequest, SequenceFacts, Source, differences
@@ -22,7 +22,7 @@ from warpslam.runtime.cores import slice_count
 from warpslam.slam import Slam
 from warpslam.slam_state import state_arrays, state_from_arrays
 from warpslam.storage.atomic import sync_folder
-from warpslam.storage.state_file import StateFormat, read_state, write_state
+from warpslam.storage.state_file import StateFields, StateFormat, read_state, write_state
 
 if TYPE_CHECKING:
     from warpslam.pipeline.methods import Method
@@ -229,10 +229,15 @@ def frame_digest(frame: Frame) -> str:
 def _saved_run(path: str, header: dict[str, Any], arrays: dict[str, np.ndarray]) -> SavedRun:
     try:
         run = header["run"]
-        request, facts = RunRequest.from_dict(run["request"]), SequenceFacts(**run["input"])
+        request, facts = RunRequest.from_dict(run["request"]), SequenceFacts.from_dict(run["input"])
         record = RunRecord.from_state(run["record"], arrays)
         if request.config is None:
             raise ValueError("its request has no settings")
-        return SavedRun(path, request, facts, record, (header["slam"], arrays))
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{path}: field run is damaged ({error!r}): use another copy") from None
+        record.check_frames(facts.frame_count)
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{path}: field run is damaged ({brief(repr(error))}): use another copy") from None
+    fields = StateFields(path, header, arrays)
+    count, expected = len(fields.array("poses", np.float64, (None, 4, 4))), record.first_index + len(record.results)
+    if count < expected:
+        raise fields.damaged("poses", f"{count} of them, expected those of the {expected} frames of the run")
+    return SavedRun(path, request, facts, record, (fields.mapping("slam"), arrays))

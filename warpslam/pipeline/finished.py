@@ -30,8 +30,8 @@ from warpslam.runs.folder import RunFolder
 from warpslam.runs.manifest import note_changed
 from warpslam.runs.metrics import RunMetrics
 from warpslam.runs.record import FINISHED, UNFINISHED, RunRecord
+from warpslam.runs.timing import RunTiming
 from warpslam.spread import spread
-from warpslam.storage.json_files import read_json
 from warpslam.storage.tum import associate, read_tum
 
 if TYPE_CHECKING:
@@ -250,11 +250,8 @@ def extract_mesh(
 
 def frame_indices(folder: RunFolder, count: int) -> list[int]:
     """Number in its sequence of each of the ``count`` frames in trajectory.tum."""
-    timing = read_json(folder.require(folder.timing, "so it is unknown which frames it used"))
-    try:
-        indices = [int(frame["index"]) for frame in timing["frames"]]
-    except (KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"{folder.timing}: expected frames with an index each ({error!r})") from error
+    timing = RunTiming.read(folder.require(folder.timing, "so it is unknown which frames it used"))
+    indices = [frame.index for frame in timing.frames]
     if len(indices) != count:
         raise DatasetError(f"{folder.timing} has {len(indices)} frames and {folder.trajectory.name} {count}; run again")
     return indices

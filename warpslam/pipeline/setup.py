@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from warpslam.camera import ONE_MOMENT, Intrinsics, SensorTiming
+from warpslam.config import Config
 from warpslam.errors import CheckpointError, ConfigError, InputError
 from warpslam.evaluation import load_mesh
 from warpslam.pipeline.methods import build_method, check_method, has_checkpoints, load_method
@@ -28,7 +29,6 @@ from warpslam.synthetic import demo
 if TYPE_CHECKING:
     import trimesh
 
-    from warpslam.config import Config
     from warpslam.pipeline.methods import Method
     from warpslam.sequences.base import RgbdSequence
 

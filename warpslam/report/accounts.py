@@ -10,6 +10,7 @@ from warpslam.report.data import RunData
 from warpslam.report.page import Html, element, figures, join, legend, missing, section, table
 from warpslam.report.text import cubic_metres, duration, megabytes, percent
 from warpslam.runs.record import UNREADABLE
+from warpslam.runs.timing import PhaseTime
 
 MAX_LISTED = 100
 
@@ -23,27 +24,26 @@ def timing_section(run: RunData) -> Html:
     total = sum(seconds for _, seconds in shares)
     keys = {name: f"c{n % 6}" if n < 6 else "rest" for n, (name, _) in enumerate(shares)}
     parts = [(keys[name], f"{name}: {duration(s)}, {percent(s / total)}", s) for name, s in shares]
-    phases = run.timing.get("phases", {})
+    phases = run.timing.phases
     rows = []
     for name, seconds in shares:
-        phase = phases.get(name, {})
-        each = duration(phase.get("mean_seconds")) or ""
-        calls = str(phase.get("calls", ""))
+        phase = phases.get(name, PhaseTime())
+        each = duration(phase.mean_seconds) or ""
+        calls = "" if phase.calls is None else str(phase.calls)
         label = element("span", element("i", class_=f"swatch {keys[name]}"), name)
         rows.append([label, duration(seconds) or "", percent(seconds / total), calls, each])
     content: list[Html] = [
         charts.share_bar("Share of each stage", parts),
         table(("", "time", "share", "calls", "each"), rows, "numbers"),
     ]
-    records = run.timing.get("frames", [])
+    records = [frame.seconds for frame in run.timing.frames]
     names = [name for name in phases if any(name in record for record in records)]
     if records and names:
         columns = [
-            (keys.get(name, "rest"), name, np.array([float(record.get(name) or 0.0) for record in records]))
-            for name in names
+            (keys.get(name, "rest"), name, np.array([record.get(name, 0.0) for record in records])) for name in names
         ]
         chart = charts.stacked_bars(
-            "Seconds a frame", [int(record["index"]) for record in records], columns,
+            "Seconds a frame", [frame.index for frame in run.timing.frames], columns,
             x_label="frame", y_label="time [s]",
         )  # fmt: skip
         entries = legend(*((key, name) for key, name, _ in columns))
@@ -53,8 +53,8 @@ def timing_section(run: RunData) -> Html:
 
 def stage_seconds(run: RunData) -> list[tuple[str, float]]:
     """Name and time [s] of each part of a run, the longest first; together they make up its total."""
-    stages = {name: float(s) for name, s in run.timing.get("stages_seconds", {}).items() if s is not None}
-    phases = {name: float(phase["seconds"]) for name, phase in run.timing.get("phases", {}).items()}
+    stages = {name: seconds for name, seconds in run.timing.stages_seconds.items() if seconds is not None}
+    phases = {name: phase.seconds for name, phase in run.timing.phases.items()}
     total = stages.pop("total", 0.0)
     compile_seconds = stages.get("kernel_compile", 0.0)
     # "frames" holds reading and the phases, "setup" the compiling, "finish" its own phases.
@@ -90,7 +90,7 @@ def memory_section(run: RunData) -> Html:
         rows = [
             [
                 name,
-                f"{level.spacing_m:g} m",
+                "–" if level.spacing_m is None else f"{level.spacing_m:g} m",
                 " × ".join(str(n) for n in level.shape),
                 megabytes(level.bytes) or "",
                 charts.value_bar(level.bytes, largest, "c0"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from warpslam.runs.metrics import RunMetrics
 from warpslam.runs.panels import Panel, load_panels
 from warpslam.runs.record import RunRecord
 from warpslam.runs.request import Source
+from warpslam.runs.timing import RunTiming
 from warpslam.storage.json_files import read_json
 from warpslam.storage.tum import associate, read_tum
 
@@ -33,8 +33,8 @@ class RunData:
     metrics: RunMetrics
     """Its figures."""
 
-    timing: dict[str, Any]
-    """Content of timing.json; empty where there is none."""
+    timing: RunTiming
+    """Its times; empty where the run did not record them."""
 
     config: str | None
     """Text of the settings; None without."""
@@ -71,8 +71,8 @@ class RunData:
         return cls(
             folder,
             RunMetrics.read(folder.metrics),
-            read_json(folder.timing) if folder.timing.is_file() else {},
-            folder.config.read_text(encoding="utf-8") if folder.config.is_file() else None,
+            RunTiming.read(folder.timing) if folder.timing.is_file() else RunTiming(),
+            folder.read_config_text(),
             _read_record(folder, poses, truth),
             timestamps,
             poses,
@@ -143,5 +143,5 @@ def _read_record(folder: RunFolder, poses: np.ndarray, truth: np.ndarray | None)
         return RunRecord()
     try:
         return RunRecord.from_rows(read_json(folder.frame_records), poses, truth)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"{folder.frame_records}: does not fit the run ({error!r}); run again") from error
+    except ValueError as error:
+        raise DatasetError(f"{folder.frame_records}: does not fit the run ({error}); run again") from error

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from warpslam.config import Config
 from warpslam.errors import ConfigError, DatasetError
+from warpslam.reading import read_text
 from warpslam.runs.request import Source
 from warpslam.storage.atomic import sync_folder
 from warpslam.storage.json_files import read_json, write_json
@@ -267,8 +268,21 @@ class RunFolder:
         fields = read_json(self.source)
         try:
             return Source.from_dict(fields)
-        except TypeError as error:
+        except ValueError as error:
             raise DatasetError(f"{self.source}: expected path, dataset, camera and command ({error})") from error
+
+    def read_config_text(self) -> str | None:
+        """Settings of the run as they are written; None without.
+
+        Raises:
+            DatasetError: The file can't be read as text.
+        """
+        if not self.config.is_file():
+            return None
+        try:
+            return read_text(self.config)
+        except OSError as error:
+            raise DatasetError(f"{self.config}: {error.strerror or error}; run again to write it anew") from error
 
     def read_config(self) -> Config:
         """Settings of the run.

@@ -8,15 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from warpslam.errors import DatasetError
 from warpslam.frames import FrameStatus
-from warpslam.storage.json_files import read_json, to_json, write_json
+from warpslam.storage.json_files import Finite, Index, Number, read_as, to_json, write_json
 
-Number = float | None
+_Corner = Annotated[list[Number], Field(min_length=3, max_length=3)]
+_Bounds = Annotated[list[_Corner], Field(min_length=2, max_length=2)]
 
 
 class _Part(BaseModel):
@@ -147,8 +147,8 @@ class Level(_Part):
 class Keyframes(_Part):
     """Keyframes and what they have in common."""
 
-    frames: list[int] = Field(default_factory=list, description="number of each among the processed frames")
-    overlaps: list[tuple[int, int, float]] = Field(
+    frames: list[Index] = Field(default_factory=list, description="number of each among the processed frames")
+    overlaps: list[tuple[Index, Index, Finite]] = Field(
         default_factory=list, description="pairs of positions in that list, and the share of their views in common"
     )
 
@@ -171,7 +171,7 @@ class Loops(_Part):
     apart_keyframes: int = Field(0, description="keyframes of parts that nothing joins to the first one")
     remapped: int = Field(0, description="times that a part of the map was made anew")
     remapped_keyframes: int = Field(0, description="keyframes that it was made of, summed over these")
-    edges: list[tuple[int, int]] = Field(default_factory=list, description="loops: frames among those processed")
+    edges: list[tuple[Index, Index]] = Field(default_factory=list, description="loops: frames among those processed")
     seconds: Number = Field(None, description="spent, since the start or the last resume [s]")
     remapping_seconds: Number = Field(None, description="spent on making the map anew, likewise [s]")
 
@@ -292,7 +292,7 @@ class RunMetrics(Errors):
     found_timing: FoundTiming = _part(FoundTiming, "timing of the camera, where it was estimated")
     map: MapSize = _part(MapSize, "what the map takes")
     levels: dict[str, Level] = Field(default_factory=dict, description="feature grids by level")
-    bounds_m: list[list[Number]] | None = Field(None, description="lower and upper corner of the grids [m]")
+    bounds_m: _Bounds | None = Field(None, description="lower and upper corner of the grids [m]")
     observed_volume_m3: Number = Field(None, description="cells that depth rays of mapped frames crossed [m^3]")
     keyframes: Keyframes = _part(Keyframes, "keyframes")
     loops: Loops = _part(Loops, "places that were recognised; left out where none were looked for")
@@ -307,12 +307,7 @@ class RunMetrics(Errors):
         Raises:
             DatasetError: The file can't be read, or a field is not of its kind.
         """
-        try:
-            return cls.model_validate(read_json(path))
-        except ValidationError as error:
-            fault = error.errors()[0]
-            name = ".".join(map(str, fault["loc"]))
-            raise DatasetError(f"{path}: {name}: {fault['msg']} (got {fault['input']!r}); run again") from None
+        return read_as(path, cls)
 
     def write(self, path: Path) -> None:
         """Write metrics.json.

@@ -7,11 +7,14 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, Field, field_validator
 
 from warpslam.frames import FrameResult, FrameStatus
+from warpslam.poses import are_rigid
+from warpslam.storage.json_files import Finite, Index, Number, Seconds, checked
 
 if TYPE_CHECKING:
     from warpslam.evaluation import AteResult, ReconstructionResult
@@ -29,6 +32,74 @@ UNFINISHED = "unfinished"
 _ROW_FIELDS = ("timestamp", "status", "message", "inliers", "depth_error", "correlation", "covariance", "losses")
 # A report says what a file has, even if that is no status of ours.
 _STATUSES = {str(status): status for status in FrameStatus}
+
+
+_Row6 = Annotated[list[Annotated[float, Field(ge=-1e30, le=1e30)]], Field(min_length=6, max_length=6)]
+_Covariance = Annotated[list[_Row6], Field(min_length=6, max_length=6)]
+_FARTHEST = 1e12
+_TIMING_FIELDS = {"depth_delay", "readout", "depth_delay_sigma", "readout_sigma"}
+
+
+class _LeftOut(BaseModel, extra="forbid"):
+    index: Index
+    message: str
+
+
+class _Row(BaseModel):
+    """A frame in frames.json. Early files have not all of it, and others may have more."""
+
+    index: Index
+    timestamp: Number
+    status: str
+    message: str
+    inliers: Number
+    losses: dict[str, Number]
+    depth_error: Number = None
+    correlation: Number = None
+    covariance: _Covariance | None = None
+
+
+class _Rows(BaseModel):
+    """Content of frames.json."""
+
+    frames: list[_Row]
+    left_out: list[_LeftOut]
+
+
+class _Result(BaseModel, extra="forbid"):
+    """A `FrameResult` in a checkpoint, all but its pose. JSON of checkpoints knows NaN and infinity."""
+
+    index: Index
+    timestamp: Finite
+    status: FrameStatus
+    losses: dict[str, float]
+    inliers: float
+    depth_error: float
+    correlation: float | None
+    covariance: _Covariance | None
+    timings: dict[str, Seconds]
+    message: str
+    reference: Index | None
+    sensor_timing: dict[str, float]
+
+    @field_validator("sensor_timing")
+    @classmethod
+    def _is_whole(cls, value: dict[str, float]) -> dict[str, float]:
+        if value and value.keys() != _TIMING_FIELDS:
+            raise ValueError(f"expected {', '.join(sorted(_TIMING_FIELDS))}, or nothing")
+        return value
+
+
+class _State(BaseModel, extra="forbid"):
+    """A `RunRecord` in a checkpoint, all but its poses."""
+
+    position: Index
+    frame_indices: list[Index]
+    left_out: list[_LeftOut]
+    seconds: dict[str, Seconds]
+    first_index: Index
+    digests: list[tuple[Index, str]]
+    results: list[_Result]
 
 
 @dataclass(frozen=True)
@@ -165,20 +236,17 @@ class RunRecord:
             truth: True ones, NaN where unknown; None where there are none at all.
 
         Raises:
-            KeyError: A field is missing.
-            TypeError: A field is unknown, or not of its kind.
-            ValueError: The number of frames is not that of the poses.
+            ValueError: A field is missing or not of its kind, or the number of frames is not that of the poses.
         """
-        record = cls(left_out=[LeftOut(**frame) for frame in content["left_out"]])
+        rows = checked(_Rows, content)
+        record = cls(left_out=[LeftOut(frame.index, frame.message) for frame in rows.left_out])
         truth = np.full((len(poses), 4, 4), np.nan) if truth is None else truth
-        for position, (row, pose, true_pose) in enumerate(zip(content["frames"], poses, truth, strict=True)):
-            # Early files have not all of them.
-            row = {"depth_error": None, "correlation": None, "covariance": None, **row}
-            values = {name: _known(row[name]) for name in _ROW_FIELDS}
-            values |= {"correlation": row["correlation"], "covariance": _matrix(row["covariance"])}
-            values["status"] = _STATUSES.get(row["status"], row["status"])
-            values["losses"] = {name: _known(value) for name, value in row["losses"].items()}
-            record.add(row["index"], true_pose, FrameResult(index=position, T_world_camera=pose, **values))
+        for position, (row, pose, true_pose) in enumerate(zip(rows.frames, poses, truth, strict=True)):
+            values = {name: _known(getattr(row, name)) for name in _ROW_FIELDS}
+            values |= {"correlation": row.correlation, "covariance": _matrix(row.covariance)}
+            values["status"] = _STATUSES.get(row.status, row.status)
+            values["losses"] = {name: _known(value) for name, value in row.losses.items()}
+            record.add(row.index, true_pose, FrameResult(index=position, T_world_camera=pose, **values))
         return record
 
     def to_state(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -203,30 +271,55 @@ class RunRecord:
         """What `to_state` gave; takes its arrays out of ``arrays``.
 
         Raises:
-            KeyError: A field is missing.
-            TypeError: A field is unknown, or not of its kind.
-            ValueError: Lists have different lengths, or a value is not of its kind.
+            KeyError: An array is missing.
+            ValueError: A field is missing, unknown or not of its kind, or lists have different lengths.
         """
+        state = checked(_State, header)
         poses, truth = arrays.pop("run_poses"), arrays.pop("run_truth_poses")
-        record = cls(
-            position=int(header["position"]),
-            frame_indices=[int(index) for index in header["frame_indices"]],
-            truth_poses=list(truth.reshape(-1, 4, 4)),
-            results=[
-                FrameResult(
-                    T_world_camera=pose,
-                    **{**row, "status": FrameStatus(row["status"]), "covariance": _matrix(row["covariance"])},
-                )
-                for pose, row in zip(poses, header["results"], strict=True)
-            ],
-            left_out=[LeftOut(int(frame["index"]), str(frame["message"])) for frame in header["left_out"]],
-            first_index=int(header["first_index"]),
-            digests={int(index): str(digest) for index, digest in header["digests"]},
-        )
-        record.seconds.update({str(stage): float(seconds) for stage, seconds in header["seconds"].items()})
-        if not len(record.results) == len(record.frame_indices) == len(record.truth_poses):
+        if not len(state.results) == len(state.frame_indices) == len(truth) == len(poses):
             raise ValueError("its lists have different lengths")
+        if state.position != len(state.results) + len(state.left_out):
+            raise ValueError(
+                f"position: {state.position} frames are done, expected the {len(state.results)} that were processed "
+                f"and the {len(state.left_out)} left out"
+            )
+        for name, array in (("run_poses", poses), ("run_truth_poses", truth)):
+            if array.dtype != np.float64 or array.shape[1:] != (4, 4):
+                raise ValueError(f"{name} is {array.dtype} {array.shape}, expected float64 (any, 4, 4)")
+        if not are_rigid(poses):
+            raise ValueError("run_poses: they are no rigid transforms, or too far from the origin")
+        if (np.abs(truth) > _FARTHEST).any():  # NaN is not: it stands for unknown ones
+            raise ValueError(f"run_truth_poses: a number beyond {_FARTHEST:g}")
+        record = cls(
+            position=state.position,
+            frame_indices=state.frame_indices,
+            truth_poses=list(truth),
+            results=[
+                FrameResult(T_world_camera=pose, **{**dict(row), "covariance": _matrix(row.covariance)})
+                for pose, row in zip(poses, state.results, strict=True)
+            ],
+            left_out=[LeftOut(frame.index, frame.message) for frame in state.left_out],
+            first_index=state.first_index,
+            digests=dict(state.digests),
+        )
+        record.seconds.update(state.seconds)
         return record
+
+    def check_frames(self, count: int) -> None:
+        """Whether all frames that it names are among the ``count`` of a sequence.
+
+        Raises:
+            ValueError: Names the field and the frame.
+        """
+        named = {
+            "frame_indices": self.frame_indices,
+            "left_out": [frame.index for frame in self.left_out],
+            "digests": self.digests,
+        }
+        for name, indices in named.items():
+            for index in indices:
+                if index >= count:
+                    raise ValueError(f"{name}: frame {index} is none of the {count} of the sequence")
 
 
 def _known(value: Any) -> Any:
@@ -288,7 +381,4 @@ def _matrix(rows: Any) -> np.ndarray | None:
     """A covariance (6, 6) from its rows; None where there is none."""
     if rows is None:
         return None
-    matrix = np.array(rows, np.float64)
-    if matrix.shape != (6, 6):
-        raise ValueError(f"a covariance has shape {matrix.shape}, expected (6, 6)")
-    return matrix
+    return np.array(rows, np.float64)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from warpslam.config import Config
 from warpslam.errors import ConfigError
+from warpslam.storage.json_files import checked
 
 if TYPE_CHECKING:
     from warpslam.sequences.base import RgbdSequence
@@ -53,9 +54,9 @@ class Source:
         """What `dataclasses.asdict` gave, in files of earlier versions as well.
 
         Raises:
-            TypeError: A field is missing or unknown.
+            ValueError: A field is missing, unknown or not of its kind.
         """
-        source = cls(**fields)
+        source = checked(cls, fields)
         # Early files know the built-in sequence by its missing folder alone.
         return source if source.path is not None else replace(source, dataset=DEMO)
 
@@ -170,19 +171,19 @@ class RunRequest:
         """What `to_dict` gave, after a trip through JSON.
 
         Raises:
-            TypeError: A field is unknown.
             KeyError: A field is missing.
-            ConfigError: A setting does not fit.
+            ValueError: A field is unknown or not of its kind, or (`ConfigError`) a setting does not fit.
         """
-        start, stop, step = fields["frames"]
-        return cls(
-            **{
+        source, config = fields["source"], fields["config"]
+        if not isinstance(source, dict | None) or not isinstance(config, dict | None):
+            raise ValueError(f"source and config are {source!r} and {config!r}, expected mappings")
+        return checked(
+            cls,
+            {
                 **fields,
-                "source": None if fields["source"] is None else Source.from_dict(fields["source"]),
-                "frames": (start, stop, step),
-                "config": None if fields["config"] is None else Config.from_dict(fields["config"]),
-                "overrides": tuple(fields["overrides"]),
-            }
+                "source": None if source is None else Source.from_dict(source),
+                "config": None if config is None else Config.from_dict(config),
+            },
         )
 
 
@@ -201,6 +202,15 @@ class SequenceFacts:
 
     timing: dict[str, Any]
     """When its pixels are taken, by field."""
+
+    @classmethod
+    def from_dict(cls, fields: dict[str, Any]) -> SequenceFacts:
+        """What `dataclasses.asdict` gave.
+
+        Raises:
+            ValueError: A field is missing, unknown or not of its kind.
+        """
+        return checked(cls, fields)
 
     @classmethod
     def of(cls, sequence: RgbdSequence) -> SequenceFacts:

@@ -15,7 +15,7 @@ import numpy as np
 
 from warpslam.camera import MAX_IMAGE_SIZE
 from warpslam.errors import DatasetError, MissingDependencyError, brief
-from warpslam.reading import MEGABYTE, read_bytes
+from warpslam.reading import ARCHIVE_ERRORS, MEGABYTE, read_bytes
 from warpslam.sequences.time_lists import unit_of
 
 FILE_LIMIT = 512 * MEGABYTE
@@ -146,7 +146,7 @@ def _read_array(path: Path) -> np.ndarray:
                 f"{path}: holds {len(names)} arrays ({brief(', '.join(names))}); keep one, or call it depth"
             )
         return loaded[names[0]]
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile, zlib.error, SyntaxError, MemoryError) as error:
+    except ARCHIVE_ERRORS as error:
         raise DatasetError(f"{path}: damaged or not a NumPy file ({brief(error)}); fetch the file again") from error
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 
 from warpslam.errors import DatasetError, MissingDependencyError, brief
 from warpslam.poses import pose_from_vector
-from warpslam.reading import MEGABYTE, check_regular, read_bytes
+from warpslam.reading import ARCHIVE_ERRORS, MEGABYTE, check_regular, read_bytes
 from warpslam.sequences.base import Remark
 from warpslam.sequences.calibration import find_calibration
 from warpslam.sequences.files import typed_name
@@ -128,7 +127,7 @@ def _source(path: Path) -> tuple[set[str], Callable[[str], bytes]]:
     try:
         check_regular(path)
         archive: Any = zipfile.ZipFile(path)
-    except (OSError, zipfile.BadZipFile) as error:
+    except ARCHIVE_ERRORS as error:
         raise DatasetError(
             f"{path}: can't be read as .r3d, which is a zip archive ({error}); export it again"
         ) from error
@@ -141,7 +140,7 @@ def _source(path: Path) -> tuple[set[str], Callable[[str], bytes]]:
                     f"{path}: {name} has {size / MEGABYTE:.0f} MB, expected at most {FILE_LIMIT // MEGABYTE}"
                 )
             return archive.read(name)
-        except (OSError, KeyError, zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError) as error:
+        except ARCHIVE_ERRORS as error:
             raise DatasetError(f"{path}: {name} is damaged or missing ({error}); export it again") from error
 
     return set(archive.namelist()), read_member

@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,10 +20,11 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from warpslam.errors import CheckpointError, ConfigError
+from warpslam.errors import CheckpointError, ConfigError, brief
 from warpslam.poses import are_rigid
 from warpslam.reading import check_name, check_regular
 from warpslam.storage.atomic import replacing
+from warpslam.storage.json_files import checked
 
 T = TypeVar("T")
 
@@ -31,6 +32,8 @@ _METADATA = "__metadata__"
 _KEY = "warpslam"
 _NO_DIGEST = "0" * 64
 _CHUNK = 1 << 20
+_LEAST_SHARE = 1e-14  # of the largest variance: an eigenvalue below it is none
+_LARGEST_VARIANCE = 1e15  # beside which what is added to it is lost
 
 
 @dataclass(frozen=True)
@@ -218,6 +221,31 @@ class StateFields:
         except (TypeError, ConfigError) as error:
             raise self.damaged(name, error) from None
 
+    def checked(self, name: str, kind: type[T]) -> T:
+        """A mapping as a model or data class, each value of its kind."""
+        try:
+            return checked(kind, self.mapping(name))
+        except ValueError as error:
+            raise self.damaged(name, error) from None
+
+    def names(self, name: str, known: Collection[str]) -> list[str]:
+        """Some of the names that are known, each once."""
+        value = self.header.get(name)
+        if not isinstance(value, list) or any(one not in known for one in value) or len(set(value)) < len(value):
+            raise self.damaged(name, f"{brief(repr(value))} are not some of {', '.join(sorted(known))}")
+        return value
+
+    def covariances(self, name: str, count: int) -> np.ndarray:
+        """Of poses, float64 (``count``, 6, 6), symmetric and invertible; rounding may have made one indefinite."""
+        found = self.array(name, np.float64, (count, 6, 6))
+        size = np.abs(found).max(axis=(1, 2), initial=0.0)[:, None]
+        is_symmetric = (np.abs(found - found.swapaxes(1, 2)).max(axis=2, initial=0.0) <= 1e-6 * size).all()
+        if size.max(initial=0.0) > _LARGEST_VARIANCE or not is_symmetric:
+            raise self.damaged(name, "they are no covariances, or too large")
+        if (np.abs(np.linalg.eigvalsh(found)) <= _LEAST_SHARE * size).any():
+            raise self.damaged(name, "they are no covariances: one can't be inverted")
+        return found
+
     def mapping(self, name: str) -> dict[str, Any]:
         """Names and values."""
         value = self.header.get(name)
@@ -228,8 +256,8 @@ class StateFields:
     def integer(self, name: str) -> int:
         """A whole number from 0 on."""
         value = self.header.get(name)
-        if type(value) is not int or value < 0:
-            raise self.damaged(name, f"expected a whole number, found {value!r}")
+        if type(value) is not int or not 0 <= value < 1 << 63:
+            raise self.damaged(name, f"expected a whole number, found {brief(repr(value))}")
         return value
 
     def frame(self, name: str, count: int) -> int | None:

@@ -22,8 +22,6 @@ def read_lines(path: Path) -> list[tuple[int, list[str]]]:
         raise DatasetError(
             f"{path}: can't be read as text ({error.strerror or error}); fetch the file again"
         ) from error
-    except UnicodeDecodeError as error:
-        raise DatasetError(f"{path}: can't be read as text ({error.reason}); fetch the file again") from error
     lines = ((number, line.replace(",", " ").split()) for number, line in enumerate(text.splitlines(), start=1))
     return [(number, words) for number, words in lines if words and not words[0].startswith("#")]
 
