@@ -81,7 +81,7 @@ def _render(
 ) -> RenderedImage:
     width = -(-camera.width // stride)
     height = -(-camera.height // stride)
-    rows = max(1, RAYS_PER_CHUNK // width)
+    rows = min(height, max(1, RAYS_PER_CHUNK // width))
     guided = depth is not None
     stratified = sampling.stratified if guided else FIRST_PASS_SAMPLES
     batch = RayBatch(rows * width, max(stratified, sampling.stratified + sampling.surface), device)
