@@ -279,16 +279,31 @@ def test_settings_are_refused_before_any_worker_starts(tmp_path):
 def test_summary_files(tmp_path):
     """A row a job; text from errors can't break the page."""
     statuses = [
-        JobStatus("a", "finished", 4, 4, 0.0123, 2.5, 61.04, 1, 512.4, "", 2, 3),
+        JobStatus("a", "finished", 4, 4, 0.0123, 2.5, 61.04, 1, 512.4, "", 2, 3, 0.9123, 24.5),
         JobStatus("b", "failed", message="<script>alert(1)</script>\nsecond line"),
     ]
     csv_path, html_path = write_summary(statuses, tmp_path)
     rows = list(csv.reader(csv_path.open()))
     assert rows[1][:2] == ["a", "finished (2 attempts, resumed after 3 frames)"]
-    assert rows[1][2:] == ["4/4", "1", "1.23", "2.50", "61.0", "512", ""]
-    assert rows[2][-1] == "<script>alert(1)</script>"
+    figures = dict(zip(rows[0], rows[1], strict=True))
+    assert rows[1][2:] == ["4/4", "1", "1.23", "91.23", "24.50", "2.50", "61.0", "512", ""]
+    assert figures["surface < 5 cm [%]"] == "91.23" and figures["PSNR [dB]"] == "24.50"
+    assert rows[2][-1] == "<script>alert(1)</script>" and len(rows) == 3
     page = html_path.read_text()
     assert "1 of 2 sequences done" in page and "<script>" not in page and "&lt;script&gt;" in page
+
+
+def test_summary_has_means(tmp_path):
+    """Over what is done, now or before; where some lack a figure, it says over how many it is."""
+    statuses = [
+        JobStatus("a", "finished", 4, 4, 0.01, 2.0, 60.0, 1, 500.0, psnr_db=20.0),
+        JobStatus("b", "done before", 4, 4, 0.03, 4.0, 20.0, 0, 700.0, completion_ratio=0.5, psnr_db=30.0),
+        JobStatus("c", "failed", 2, 4, 9.0, 1.0, 1.0, 2, 900.0),
+    ]
+    csv_path, html_path = write_summary(statuses, tmp_path)
+    *_, last = csv.reader(csv_path.open())
+    assert last == ["mean of 2", "", "", "0.5", "2.00", "50.00 (1 of 2)", "25.00", "3.00", "40.0", "600", ""]
+    assert "<td>mean of 2</td>" in html_path.read_text()
 
 
 def test_command(tmp_path, capsys):

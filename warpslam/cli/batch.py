@@ -131,8 +131,10 @@ def progress() -> Iterator[Callable[[JobStatus], None]]:
     with Live(_table([]), refresh_per_second=4) as live:
 
         def show(status: JobStatus) -> None:
+            before = known.get(status.name)
             known[status.name] = status
-            live.update(_table(list(known.values())))
+            is_news = before is None or before.status != status.status  # shown at once, however short a job is
+            live.update(_table(list(known.values())), refresh=is_news)
 
         yield show
         # The summary follows; the same table twice would only be read twice.
