@@ -16,7 +16,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.fakes import Terminal
+from tests.fakes import FakeSequence, FakeSlam, Terminal
 from warpslam import cli
 from warpslam.batch import local as batch
 from warpslam.batch.jobs import Job, with_free_names
@@ -24,8 +24,10 @@ from warpslam.batch.local import run_batch, split_cores
 from warpslam.batch.manifest import FIELDS, read_manifest
 from warpslam.batch.status import BatchState, JobStatus
 from warpslam.batch.summary import write_summary
+from warpslam.batch.worker import execute
 from warpslam.config import Config
 from warpslam.errors import ConfigError, WarpSlamError
+from warpslam.pipeline import run as pipeline
 from warpslam.runs.request import RunRequest, Source
 from warpslam.runtime.environment import resident_bytes
 from warpslam.storage.json_files import read_json
@@ -347,6 +349,40 @@ def test_table_on_a_terminal(tmp_path, monkeypatch):
     assert cli.main(["batch", str(tmp_path / "slow"), "-o", str(tmp_path / "out")]) == 0
     text = terminal.getvalue()
     assert "running" in text and "finished" in text and "3.00" in text
+
+
+def test_figures_of_a_batch(tmp_path, monkeypatch):
+    """Each sequence logs under the name of its job; where figures go decides nothing on what is done again."""
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    monkeypatch.setattr(pipeline, "build_slam", lambda camera, *others: FakeSlam(camera))
+    monkeypatch.setattr(pipeline, "open_source", lambda source: FakeSequence(5))
+    for name in ("draw_plots", "draw_panels", "write_report"):
+        monkeypatch.setattr(pipeline, name, lambda *arguments: None)
+    found = []
+    monkeypatch.setattr(batch, "run_batch", lambda jobs, output, **keywords: found.extend(jobs) or [])
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "room").mkdir()
+    assert cli.main(["batch", "room", "room", "--log", "tensorboard:board", "--checkpoint-every", "0"]) == 0
+    assert [job.log for job in found] == [f"tensorboard:{tmp_path / 'board'}"] * 2
+    assert [Job.from_dict(json.loads(json.dumps(job.to_dict()))) for job in found] == found
+    assert found[0].settings_hash == replace(found[0], log="").settings_hash
+    for job in found:
+        assert execute(job, tmp_path / "out", lambda news: None) == "finished"
+    for name in ("room", "room_2"):
+        events = EventAccumulator(str(tmp_path / "board" / name))
+        events.Reload()
+        assert [event.step for event in events.Scalars("inliers")] == [1, 2, 3, 4, 5]
+        assert events.Scalars("end/ate_rmse_m")[0].value > 0
+
+
+def test_figures_that_can_go_nowhere(tmp_path, monkeypatch, capsys):
+    """One line, before any worker starts."""
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    monkeypatch.setattr(batch, "run_batch", lambda *_, **__: pytest.fail("it was started"))
+    assert cli.main(["batch", str(tmp_path), "--log", "wandb:rooms", "-o", str(tmp_path / "out")]) == 2
+    assert "pip install wandb" in capsys.readouterr().err
 
 
 def test_dead_coordinator_takes_its_workers_along(tmp_path):
