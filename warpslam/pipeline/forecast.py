@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _RECENT = 40  # frames, some calls of mapping among them
 _PROBE_FRAME = 4  # the map has something in it, and everything is warm
-_PROBE_RAYS = 100, 1000  # of two views: a launch costs the same for any number, a ray something more
+_PROBE_RAYS = 400, 2500  # of two views: a launch costs the same for any number, a ray something more
 _MESHING = 0.15  # of the time that rendering the panels takes
 # [s]. Neither the map nor its device has a part in these.
 _EVALUATION, _EVALUATION_A_FRAME = 8.0, 0.2
