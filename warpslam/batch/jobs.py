@@ -31,8 +31,8 @@ class Job:
 
     @property
     def settings_hash(self) -> str:
-        """Of all that decides on the result: name, request and the version of warpslam; neither the checkpoints nor where
-        figures go.
+        """Of all that decides on the result: name, request and the version of warpslam, but not the checkpoints, nor
+        where figures go.
         """
         fields = replace(self.request, checkpoint_every=None).to_dict()
         text = json.dumps({**fields, "name": self.name, "warpslam": __version__}, sort_keys=True)

@@ -107,9 +107,7 @@ def _figure(value: float | None, digits: int) -> str:
 
 
 def _row(texts: Sequence[str]) -> list[Html]:
-    return [
-        element("td", text, class_="number" if column in _NUMBERS else None) for column, text in enumerate(texts)
-    ]
+    return [element("td", text, class_="number" if column in _NUMBERS else None) for column, text in enumerate(texts)]
 
 
 def _html(statuses: Sequence[JobStatus], output: Path) -> str:
