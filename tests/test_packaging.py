@@ -86,6 +86,21 @@ def test_errors_name_what_pip_can_install():
         assert requirement in (name, bounds[name]), f"{file}: pip install {requirement}, but {bounds[name]}"
 
 
+def test_dockerfile_installs_what_there_is():
+    """Its extras are ours, its files are in the sources and not kept out, and its Python is one that we take."""
+    text = (REPOSITORY / "Dockerfile").read_text()
+    with open(REPOSITORY / "pyproject.toml", "rb") as file:
+        project = tomllib.load(file)["project"]
+    (extras,) = re.findall(r'"/src\[(.*)\]"', text)
+    assert set(extras.split(",")) <= set(project["optional-dependencies"])
+    ignored = (REPOSITORY / ".dockerignore").read_text().split()
+    for name in [*re.findall(r"/src/(\S+)", text), "pyproject.toml", "README.md", "LICENSE", "warpslam"]:
+        assert (REPOSITORY / name).exists() and name not in ignored, name
+    (version,) = re.findall(r"FROM python:([\d.]+)-slim", text)
+    assert f"Programming Language :: Python :: {version}" in project["classifiers"]
+    assert 'ENTRYPOINT ["warpslam"]' in text and "warpslam" in project["scripts"]
+
+
 @pytest.mark.parametrize("kind", ["wheel", "sdist"])
 def test_demo_from_what_was_built(distributions, tmp_path, kind):
     """In a virtual environment with the wheel, or the sdist, beside it only what it depends on: a run of two frames,
