@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 _RECENT = 40  # frames, some calls of mapping among them
 _PROBE_FRAME = 4  # the map has something in it, and everything is warm
 _PROBE_RAYS = 400, 2500  # of two views: a launch costs the same for any number, a ray something more
+_USUAL_KEYFRAMES, _USUAL_FRAMES = 2, 30  # so many in so many: what is expected before there are frames to go by
 _MESHING = 0.15  # of the time that rendering the panels takes
 # [s]. Neither the map nor its device has a part in these.
 _EVALUATION, _EVALUATION_A_FRAME = 8.0, 0.2
@@ -95,7 +96,9 @@ class Forecast:
         self.fps = 0.0
 
     def after_frame(self, result: FrameResult, done: int) -> float:
-        """Seconds left after a frame, of which ``done`` are done."""
+        """Seconds left after a frame, of which ``done`` are done; 0 where nothing tells, as after the first one, in
+        which more is mapped than in any other.
+        """
         self._done += 1
         self._note_mapping(result)
         self.fps = self._rate.after_frame(time.perf_counter())
@@ -105,6 +108,8 @@ class Forecast:
             start = time.perf_counter()
             self._pictures = self._probe(result)
             self._rate.leave_out(time.perf_counter() - start)
+        if self._done == 1:
+            return 0.0
         return max(self._total - done, 0) / self.fps + self.after_frames
 
     @property
@@ -135,8 +140,9 @@ class Forecast:
             direct, sampling = self._config.supervision, self._config.sampling
             samples = direct.free_samples + direct.near_samples + 1
             iterations = iterations * (sampling.stratified + sampling.surface) / samples + mapping.refined_directly
-        count = round(len(keyframes) * self._total / max(self._done, 1))
-        return call * iterations / mapping.iterations * mapping.rounds_for(count)
+        # The first frame is one in any case, and tells nothing of how many follow.
+        count = (len(keyframes) - 1 + _USUAL_KEYFRAMES) / (self._done + _USUAL_FRAMES) * self._total
+        return call * iterations / mapping.iterations * mapping.rounds_for(round(count))
 
     def _note_mapping(self, result: FrameResult) -> None:
         seconds = result.timings.get("mapping")
