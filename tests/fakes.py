@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -92,6 +93,7 @@ class FakeSlam:
         self.results: list[FrameResult] = []
         self.given: list[np.ndarray | None] = []
         self.finished = False
+        self.loops: SimpleNamespace | None = None
 
     def step(self, rgb, depth, timestamp=None, T_world_camera=None, *, depth_timestamp=None) -> FrameResult:
         index = len(self.results)
@@ -140,7 +142,8 @@ class FakeSlam:
         return mesh
 
     def inventory(self) -> dict[str, object]:
-        return {"memory": {"state_bytes": 8}}
+        loops = {} if self.loops is None else {"loops": {"edges": self.loops.edges}}
+        return {"memory": {"state_bytes": 8}, **loops}
 
     def save(self, path: Path) -> None:
         Path(path).write_bytes(b"fake map")

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import email
+import itertools
 import os
+import re
 import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import venv
 import zipfile
 from pathlib import Path
@@ -59,24 +62,61 @@ def test_metadata(distributions):
         metadata = email.message_from_bytes(archive.read(name))
     for field in ("Name", "Version", "Summary", "License-Expression", "Requires-Python", "Description-Content-Type"):
         assert metadata[field], field
+    assert metadata["Author"] and metadata["Keywords"] and metadata["License-File"] == "LICENSE"
     assert len(metadata.get_all("Project-URL")) >= 2 and len(metadata.get_all("Classifier")) >= 8
     extras = set(metadata.get_all("Provides-Extra"))
-    assert {"bags", "cluster", "exr", "mesh", "open3d", "record", "record3d", "view"} <= extras
+    assert {"bags", "cluster", "exr", "log", "mesh", "open3d", "record", "record3d", "slurm", "view", "wandb"} <= extras
+    assert metadata.get_payload().startswith("# warpslam")
 
 
-def test_demo_from_the_wheel(distributions, tmp_path):
-    """In a virtual environment with the wheel, beside it only what it depends on: a run of two frames, with its report,
-    from the installed files.
+def test_errors_name_what_pip_can_install():
+    """Packages of other people, by the names and bounds of our extras: none of ours, which is on no index."""
+    with open(REPOSITORY / "pyproject.toml", "rb") as file:
+        project = tomllib.load(file)["project"]
+    wanted = [*project["dependencies"], *itertools.chain.from_iterable(project["optional-dependencies"].values())]
+    bounds = {re.split("[<>=[]", one)[0]: one for one in wanted}
+    named = {}
+    for path in (REPOSITORY / "warpslam").rglob("*.py"):
+        for found in re.findall(r"pip install ([^\s,;)\"]+)", path.read_text().replace('"\n', "")):
+            named[found.strip("'.")] = path.name
+    assert len(named) > 12
+    for requirement, file in named.items():
+        name = re.split("[<>=[]", requirement)[0]
+        assert name in bounds, f"{file}: pip install {requirement}"
+        assert requirement in (name, bounds[name]), f"{file}: pip install {requirement}, but {bounds[name]}"
+
+
+def test_dockerfile_installs_what_there_is():
+    """Its extras are ours, its files are in the sources and not kept out, and its Python is one that we take."""
+    text = (REPOSITORY / "Dockerfile").read_text()
+    with open(REPOSITORY / "pyproject.toml", "rb") as file:
+        project = tomllib.load(file)["project"]
+    (extras,) = re.findall(r'"/src\[(.*)\]"', text)
+    assert set(extras.split(",")) <= set(project["optional-dependencies"])
+    ignored = (REPOSITORY / ".dockerignore").read_text().split()
+    for name in [*re.findall(r"/src/(\S+)", text), "pyproject.toml", "README.md", "LICENSE", "warpslam"]:
+        assert (REPOSITORY / name).exists() and name not in ignored, name
+    (version,) = re.findall(r"FROM python:([\d.]+)-slim", text)
+    assert f"Programming Language :: Python :: {version}" in project["classifiers"]
+    assert 'ENTRYPOINT ["warpslam"]' in text and "warpslam" in project["scripts"]
+
+
+@pytest.mark.parametrize("kind", ["wheel", "sdist"])
+def test_demo_from_what_was_built(distributions, tmp_path, kind):
+    """In a virtual environment with the wheel, or the sdist, beside it only what it depends on: a run of two frames,
+    with its report, from the installed files.
     """
-    wheel, _ = distributions
+    built = distributions[kind == "sdist"]
     venv.create(tmp_path / "venv", with_pip=False)
     python = tmp_path / "venv" / "bin" / "python"
     (site,) = (tmp_path / "venv" / "lib").glob("python*/site-packages")
-    install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--no-deps", "--no-index", str(wheel)]
-    subprocess.run(install, check=True, capture_output=True)
-    # Dependencies are those of this environment; a path in a .pth file brings no editable installs along.
+    # Dependencies, and what builds an sdist, are those of this environment; a path in a .pth file brings no editable
+    # installs along.
     others = [path for path in sys.path if path.endswith("site-packages")]
     (site / "dependencies.pth").write_text("\n".join(others) + "\n")
+    install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--no-deps", "--no-index"]
+    install += ["--no-build-isolation", "--ignore-installed", str(built)]
+    subprocess.run(install, check=True, capture_output=True)
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     few = ["mapping.first_iterations=2", "mapping.iterations=2", "mapping.refinement_rounds=1", "meshing.voxel=0.1"]
     code = (
@@ -91,13 +131,14 @@ def test_demo_from_the_wheel(distributions, tmp_path):
 
 
 @pytest.mark.slow
-def test_demo_in_an_empty_environment(distributions, tmp_path):
-    """As a stranger installs it: a new environment, the wheel and all it asks for from an index, and the demo."""
-    wheel, _ = distributions
+@pytest.mark.parametrize("kind", ["wheel", "sdist"])
+def test_demo_in_an_empty_environment(distributions, tmp_path, kind):
+    """As a stranger installs it: a new environment, the wheel or the sdist, all it asks for from an index, the demo."""
+    built = distributions[kind == "sdist"]
     venv.create(tmp_path / "venv", with_pip=True)
     bin_ = tmp_path / "venv" / "bin"
     constraints = REPOSITORY / "constraints.txt"
-    subprocess.run([bin_ / "pip", "install", "-q", "-c", constraints, str(wheel)], check=True)
+    subprocess.run([bin_ / "pip", "install", "-q", "-c", constraints, str(built)], check=True)
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     done = subprocess.run(
         [bin_ / "warpslam", "demo", "--device", "cpu", "-o", tmp_path / "run"], cwd=tmp_path, env=environment

@@ -16,7 +16,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.fakes import Terminal
+from tests.fakes import FakeSequence, FakeSlam, Terminal
 from warpslam import cli
 from warpslam.batch import local as batch
 from warpslam.batch.jobs import Job, with_free_names
@@ -24,8 +24,10 @@ from warpslam.batch.local import run_batch, split_cores
 from warpslam.batch.manifest import FIELDS, read_manifest
 from warpslam.batch.status import BatchState, JobStatus
 from warpslam.batch.summary import write_summary
+from warpslam.batch.worker import execute
 from warpslam.config import Config
 from warpslam.errors import ConfigError, WarpSlamError
+from warpslam.pipeline import run as pipeline
 from warpslam.runs.request import RunRequest, Source
 from warpslam.runtime.environment import resident_bytes
 from warpslam.storage.json_files import read_json
@@ -279,16 +281,31 @@ def test_settings_are_refused_before_any_worker_starts(tmp_path):
 def test_summary_files(tmp_path):
     """A row a job; text from errors can't break the page."""
     statuses = [
-        JobStatus("a", "finished", 4, 4, 0.0123, 2.5, 61.04, 1, 512.4, "", 2, 3),
+        JobStatus("a", "finished", 4, 4, 0.0123, 2.5, 61.04, 1, 512.4, "", 2, 3, 0.9123, 24.5),
         JobStatus("b", "failed", message="<script>alert(1)</script>\nsecond line"),
     ]
     csv_path, html_path = write_summary(statuses, tmp_path)
     rows = list(csv.reader(csv_path.open()))
     assert rows[1][:2] == ["a", "finished (2 attempts, resumed after 3 frames)"]
-    assert rows[1][2:] == ["4/4", "1", "1.23", "2.50", "61.0", "512", ""]
-    assert rows[2][-1] == "<script>alert(1)</script>"
+    figures = dict(zip(rows[0], rows[1], strict=True))
+    assert rows[1][2:] == ["4/4", "1", "1.23", "91.23", "24.50", "2.50", "61.0", "512", ""]
+    assert figures["surface < 5 cm [%]"] == "91.23" and figures["PSNR [dB]"] == "24.50"
+    assert rows[2][-1] == "<script>alert(1)</script>" and len(rows) == 3
     page = html_path.read_text()
     assert "1 of 2 sequences done" in page and "<script>" not in page and "&lt;script&gt;" in page
+
+
+def test_summary_has_means(tmp_path):
+    """Over what is done, now or before; where some lack a figure, it says over how many it is."""
+    statuses = [
+        JobStatus("a", "finished", 4, 4, 0.01, 2.0, 60.0, 1, 500.0, psnr_db=20.0),
+        JobStatus("b", "done before", 4, 4, 0.03, 4.0, 20.0, 0, 700.0, completion_ratio=0.5, psnr_db=30.0),
+        JobStatus("c", "failed", 2, 4, 9.0, 1.0, 1.0, 2, 900.0),
+    ]
+    csv_path, html_path = write_summary(statuses, tmp_path)
+    *_, last = csv.reader(csv_path.open())
+    assert last == ["mean of 2", "", "", "0.5", "2.00", "50.00 (1 of 2)", "25.00", "3.00", "40.0", "600", ""]
+    assert "<td>mean of 2</td>" in html_path.read_text()
 
 
 def test_command(tmp_path, capsys):
@@ -332,6 +349,40 @@ def test_table_on_a_terminal(tmp_path, monkeypatch):
     assert cli.main(["batch", str(tmp_path / "slow"), "-o", str(tmp_path / "out")]) == 0
     text = terminal.getvalue()
     assert "running" in text and "finished" in text and "3.00" in text
+
+
+def test_figures_of_a_batch(tmp_path, monkeypatch):
+    """Each sequence logs under the name of its job; where figures go decides nothing on what is done again."""
+    pytest.importorskip("tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    monkeypatch.setattr(pipeline, "build_slam", lambda camera, *others: FakeSlam(camera))
+    monkeypatch.setattr(pipeline, "open_source", lambda source: FakeSequence(5))
+    for name in ("draw_plots", "draw_panels", "write_report"):
+        monkeypatch.setattr(pipeline, name, lambda *arguments: None)
+    found = []
+    monkeypatch.setattr(batch, "run_batch", lambda jobs, output, **keywords: found.extend(jobs) or [])
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "room").mkdir()
+    assert cli.main(["batch", "room", "room", "--log", "tensorboard:board", "--checkpoint-every", "0"]) == 0
+    assert [job.log for job in found] == [f"tensorboard:{tmp_path / 'board'}"] * 2
+    assert [Job.from_dict(json.loads(json.dumps(job.to_dict()))) for job in found] == found
+    assert found[0].settings_hash == replace(found[0], log="").settings_hash
+    for job in found:
+        assert execute(job, tmp_path / "out", lambda news: None) == "finished"
+    for name in ("room", "room_2"):
+        events = EventAccumulator(str(tmp_path / "board" / name))
+        events.Reload()
+        assert [event.step for event in events.Scalars("inliers")] == [1, 2, 3, 4, 5]
+        assert events.Scalars("end/ate_rmse_m")[0].value > 0
+
+
+def test_figures_that_can_go_nowhere(tmp_path, monkeypatch, capsys):
+    """One line, before any worker starts."""
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    monkeypatch.setattr(batch, "run_batch", lambda *_, **__: pytest.fail("it was started"))
+    assert cli.main(["batch", str(tmp_path), "--log", "wandb:rooms", "-o", str(tmp_path / "out")]) == 2
+    assert "pip install wandb" in capsys.readouterr().err
 
 
 def test_dead_coordinator_takes_its_workers_along(tmp_path):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import threading
 from collections import Counter, namedtuple
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +22,7 @@ from warpslam.errors import WarpSlamError
 from warpslam.field import passes
 from warpslam.field.arrays import Gradients, Thresholds
 from warpslam.field.passes import render
-from warpslam.kernels import adam, compositing, gauss_newton
+from warpslam.kernels import adam, compositing, gauss_newton, images
 from warpslam.kernels import grid as grid_kernels
 from warpslam.kernels.decoder.build import decoders_for
 from warpslam.kernels.samples import Span
@@ -147,6 +149,7 @@ def test_trace_shows_both_threads(run, tmp_path):
         assert 0 <= event["ts"] and event["ts"] + event["dur"] <= 1e6 * profile.wall_seconds + 1
     kernels = [event for event in events if event["cat"] == "kernel"]
     assert len(kernels) == profile.report.launch_count
+    assert all(min(event["args"]["dim"]) >= 0 for event in kernels)
     # The second slice may run on any thread of the pool.
     forward = [event["tid"] for event in kernels if event["name"] == "middle_forward"]
     assert forward.count(0) > 10 and len(forward) - forward.count(0) > 10
@@ -157,6 +160,27 @@ def test_trace_shows_both_threads(run, tmp_path):
     tracking = [event for event in events if event["cat"] == "phase" and event["name"] == "tracking"]
     optimize = next(event for event in events if event["name"] == "optimize")
     assert tracking[0]["ts"] <= optimize["ts"] < tracking[0]["ts"] + tracking[0]["dur"]
+
+
+def test_trace_names_threads_and_dimensions(tmp_path):
+    """A thread that gets the system's identity of one that has ended keeps its own name and row."""
+    units, scale = wp.zeros((4, 6), dtype=wp.uint16, device="cpu"), wp.ones(1, dtype=float, device="cpu")
+    metres = wp.zeros((4, 6), dtype=float, device="cpu")
+
+    def work():
+        wp.launch(images.to_metres, (4, 6), [units, scale, metres], device="cpu")
+
+    with warpslam.profile() as profile:
+        for name in ("compiling", "working"):
+            thread = threading.Thread(target=work, name=name)
+            thread.start()
+            thread.join()
+    profile.write_trace(tmp_path / "trace.json")
+    events = json.loads((tmp_path / "trace.json").read_text())["traceEvents"]
+    names = {event["tid"]: event["args"]["name"] for event in events if event["ph"] == "M"}
+    launches = [event for event in events if event.get("cat") == "kernel"]
+    assert [names[event["tid"]] for event in launches] == ["compiling", "working"]
+    assert [event["args"]["dim"] for event in launches] == [[4, 6], [4, 6]]
 
 
 def test_table_names_phases_and_kernels(run):
@@ -327,8 +351,8 @@ def test_device_times_go_to_the_phase_they_belong_to(monkeypatch):
     monkeypatch.setattr(wp, "timing_end", lambda: list(pending))
     with warpslam.profile() as profile:
         with phase("mapping"):
-            profile._recorder._cuda.launched(kernel, False, 480, [])
-            profile._recorder._cuda.launched(kernel, True, 480, [])
+            profile._recorder._cuda.launched(kernel, False, (48, 10), [])
+            profile._recorder._cuda.launched(kernel, True, (480,), [])
             pending.append(Timing(f"backward kernel {kernel.key}_0123abcd", 4.0))
             pending.append(Timing(f"forward kernel {kernel.key}_0123abcd", 2.0))
             with phase("color"):
@@ -339,6 +363,7 @@ def test_device_times_go_to_the_phase_they_belong_to(monkeypatch):
     assert rows["transpose_color_weights (adjoint)"].seconds == pytest.approx(4e-3)
     assert rows["transpose_color_weights"].gigabytes == pytest.approx(480 * 256e-9)
     assert {row.phase: row.elsewhere for row in profile.report.phases}["mapping"] == pytest.approx(6e-3)
+    assert [launch.dim for launch in profile.launches] == [(480,), (48, 10), ()]
 
 
 def test_command_line(monkeypatch, tmp_path, capsys):
@@ -357,3 +382,21 @@ def test_command_line(monkeypatch, tmp_path, capsys):
     kernels = {(row["kernel"], row["phase"]) for row in report["kernels"]}
     assert {("register", "tracking"), ("register_jointly", "tracking")} <= kernels
     assert json.loads((tmp_path / "t.json").read_text())["traceEvents"]
+
+
+def test_narrow_terminal_keeps_names(run, monkeypatch, capsys):
+    """In a terminal of 80 columns figures go, and every name is there."""
+    from warpslam.cli import profile as command
+
+    profile = run[0]
+    monkeypatch.setattr(command, "_input", lambda options: (SyntheticSequence(1, 2, intrinsics=CAMERA), None))
+    monkeypatch.setattr(command, "_run", lambda *_: profile)
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("FORCE_COLOR", "1")  # a terminal, for rich
+    assert cli.main(["profile", "demo", "--all"]) == 0
+    out = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    assert max(map(len, out.splitlines())) <= 80 and "more columns on a wider terminal" in out
+    cells = [[cell.strip() for cell in line.split("│")[1:3]] for line in out.splitlines() if "│" in line]
+    assert all(any(row) for row in cells)
+    whole = "".join(cell for row in cells for cell in row).replace(" ", "")
+    assert "mark_seen" in whole and "mapping/color" in whole

@@ -83,13 +83,19 @@ def test_every_peer_can_be_loaded():
 
 
 def test_process_is_measured(tmp_path):
-    """CPU time and memory are those of the process; its output and exit status are kept."""
+    """CPU time and memory are those of the process, whatever this one holds; its output and exit status are kept."""
+    held = np.ones(400 * 2**17)  # 400 MiB
     busy = "import sys, time\nwhile time.process_time() < 0.4: pass\nb = bytearray(2**26); print('out'); sys.exit(3)"
     code, cpu, seconds, peak = run([sys.executable, "-c", busy], tmp_path / "log")
-    # What this process holds counts for the moment between fork and exec.
-    own = resident_bytes() / 2**20
-    assert code == 3 and 0.4 <= cpu < 5 and seconds >= 0.4 and 64 < peak < 1000 + own
+    assert resident_bytes() > held.nbytes
+    assert code == 3 and 0.4 <= cpu < 5 and seconds >= 0.4 and 64 < peak < 160
     assert (tmp_path / "log").read_text() == "out\n"
+
+
+def test_command_that_can_not_be_started(tmp_path):
+    """It has failed, and its log says why."""
+    code, cpu, _, peak = run([str(tmp_path / "nothing")], tmp_path / "log")
+    assert code == 1 and cpu == peak == 0 and "FileNotFoundError" in (tmp_path / "log").read_text()
 
 
 def test_judge(folder, tmp_path):

@@ -65,6 +65,16 @@ def command_of(system: str, options: argparse.Namespace, out: Path) -> list[str]
     return [sys.executable, "-m", "tools.peers.worker", system, options.folder, str(out), *frames, *more]
 
 
+# The system has a process begin with the peak memory of the one that starts it, so a small one starts the command.
+_STARTER = """
+import json, os, subprocess, sys
+process = subprocess.Popen(sys.argv[2:])
+_, status, usage = os.wait4(process.pid, 0)
+figures = os.waitstatus_to_exitcode(status), usage.ru_utime + usage.ru_stime, usage.ru_maxrss
+os.write(int(sys.argv[1]), json.dumps(figures).encode())
+"""
+
+
 def run(command: list[str], log: Path) -> tuple[int, float, float, float]:
     """Run a process to its end; its output goes to ``log``.
 
@@ -72,12 +82,23 @@ def run(command: list[str], log: Path) -> tuple[int, float, float, float]:
         Exit status, CPU seconds of it and its children, seconds on the clock, and the most memory it held [MiB].
     """
     start = time.perf_counter()
-    with open(log, "wb") as file:
-        process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
-        _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
+    reading, writing = os.pipe()
+    with open(log, "wb") as file, open(reading, encoding="utf-8") as answer:
+        try:
+            # -S: what site-packages load at the start would count as memory of the command.
+            starter = subprocess.Popen(
+                [sys.executable, "-I", "-S", "-c", _STARTER, str(writing), *command],
+                stdout=file, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL, pass_fds=[writing],
+            )  # fmt: skip
+        finally:
+            os.close(writing)
+        told = answer.read()
+        code = starter.wait()
     seconds = time.perf_counter() - start
-    return process.returncode, usage.ru_utime + usage.ru_stime, seconds, usage.ru_maxrss / 1024
+    if not told:  # it was ended before the command was
+        return code or 1, 0.0, seconds, 0.0
+    code, cpu, peak = json.loads(told)
+    return code, cpu, seconds, peak / 1024
 
 
 def judge(row: Row, out: Path, recording: Recording) -> None:

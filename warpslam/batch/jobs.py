@@ -26,9 +26,14 @@ class Job:
     request: RunRequest
     """What is asked for; it names its source."""
 
+    log: str = ""
+    """Where its figures go beside its folder, as `warpslam.viewer.figures.FigureLog` has it; empty for nowhere."""
+
     @property
     def settings_hash(self) -> str:
-        """Of all that decides on the result: name, request and the version of warpslam, but not the checkpoints."""
+        """Of all that decides on the result: name, request and the version of warpslam, but not the checkpoints, nor
+        where figures go.
+        """
         fields = replace(self.request, checkpoint_every=None).to_dict()
         text = json.dumps({**fields, "name": self.name, "warpslam": __version__}, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -39,12 +44,12 @@ class Job:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON."""
-        return {"name": self.name, "request": self.request.to_dict()}
+        return {"name": self.name, "request": self.request.to_dict(), "log": self.log}
 
     @classmethod
     def from_dict(cls, fields: dict[str, Any]) -> Job:
         """What `to_dict` gave, after a trip through JSON."""
-        return cls(fields["name"], RunRequest.from_dict(fields["request"]))
+        return cls(fields["name"], RunRequest.from_dict(fields["request"]), fields.get("log", ""))
 
 
 def with_free_names(jobs: Iterable[Job]) -> list[Job]:

@@ -61,6 +61,12 @@ class JobStatus:
     resumed_after: int = 0
     """Frames that were taken over from a checkpoint."""
 
+    completion_ratio: float | None = None
+    """Share of the true surface within 5 cm of the mesh, 0..1; where that surface is known."""
+
+    psnr_db: float | None = None
+    """Of the frames that are shown beside what the map renders [dB]."""
+
 
 Update = Callable[[JobStatus], None]
 
@@ -126,4 +132,6 @@ def ended_status(job: Job, output: Path, known: JobStatus) -> JobStatus:
         lost=frames.LOST or 0,
         peak_memory_mib=metrics.peak_memory_mib,
         resumed_after=metrics.resumed_after or 0,
+        completion_ratio=metrics.reconstruction.completion_ratio_5cm,
+        psnr_db=metrics.rendering.psnr_db,
     )

@@ -16,7 +16,7 @@ from warpslam.batch.jobs import Job
 from warpslam.batch.status import FAILED, INTERRUPTED, MEMORY, RUNNING, BatchState
 from warpslam.errors import MemoryBudgetError, WarpSlamError
 from warpslam.pipeline.methods import has_checkpoints
-from warpslam.pipeline.observer import Observer
+from warpslam.pipeline.observer import Observer, Observers
 from warpslam.runs.folder import RunFolder
 from warpslam.runtime.environment import resident_bytes
 from warpslam.runtime.stopping import terminable
@@ -114,8 +114,16 @@ def _run(job: Job, folder: Path, report: Report, watch: MemoryWatch, slot: int, 
         device=request.device or _device_of(slot),
         checkpoint_every=request.checkpoint_every if has_checkpoints(request.method) else None,
     )
-    observer = _Reporter(report, watch)
-    result = run(job.request, folder, observer=observer, go_on=go_on, overwrite=True, discard=True)
+    observers: list[Observer] = [_Reporter(report, watch)]
+    if job.log:
+        from warpslam.viewer.figures import FigureLog
+
+        observers.append(FigureLog(job.log, job.name))
+    observer = Observers(*observers)
+    try:
+        result = run(job.request, folder, observer=observer, go_on=go_on, overwrite=True, discard=True)
+    finally:
+        observer.close()
     anew = result.metrics.started_anew
     message = f"started from the beginning: {anew}" if anew else ""
     return result.status, message

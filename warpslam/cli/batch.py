@@ -21,6 +21,7 @@ from warpslam.cli.common import (
     add_command,
     add_config_option,
     add_format_options,
+    add_log_option,
     add_method_option,
     add_run_options,
     parse_frames,
@@ -47,6 +48,7 @@ def add(commands: Any) -> None:
     batch.add_argument("--workers", type=int, metavar="N", help="sequences at a time (1; on a cluster: what fits)")
     batch.add_argument("--memory-gb", type=float, metavar="GB", help="stop a worker that takes more memory than this")
     batch.add_argument("--cluster", metavar="ADDRESS", help="ray://HOST:10001 or local (Ray), slurm or slurm:PARTITION")
+    add_log_option(batch)
     add_format_options(batch)
     batch.add_argument("--preset", help="settings to start from (default: each dataset's)")
     add_config_option(batch)
@@ -116,7 +118,19 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
     ]
     if options.manifest:
         jobs += read_manifest(options.manifest, common)
-    return with_free_names(jobs)
+    log = _log_target(options.log)
+    return [replace(job, log=log) for job in with_free_names(jobs)]
+
+
+def _log_target(text: str | None) -> str:
+    """The option's value, whose folder holds in any folder; refused here rather than by every worker."""
+    if not text:
+        return ""
+    from warpslam.viewer.figures import FigureLog
+
+    FigureLog(text)
+    kind, _, place = text.partition(":")
+    return f"{kind}:{Path(place).expanduser().resolve()}" if kind == "tensorboard" else text
 
 
 @contextmanager
@@ -131,8 +145,10 @@ def progress() -> Iterator[Callable[[JobStatus], None]]:
     with Live(_table([]), refresh_per_second=4) as live:
 
         def show(status: JobStatus) -> None:
+            before = known.get(status.name)
             known[status.name] = status
-            live.update(_table(list(known.values())))
+            is_news = before is None or before.status != status.status  # shown at once, however short a job is
+            live.update(_table(list(known.values())), refresh=is_news)
 
         yield show
         # The summary follows; the same table twice would only be read twice.

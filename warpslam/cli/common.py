@@ -62,6 +62,11 @@ def add_view_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--view", action="store_true", help="look on in the browser (pip install viser)")
     add_view_address(parser, "--view-at")
     parser.add_argument("--record", metavar="FILE.rrd", help="record it for Rerun (pip install rerun-sdk)")
+    add_log_option(parser)
+
+
+def add_log_option(parser: argparse.ArgumentParser) -> None:
+    """Figures for other tools."""
     parser.add_argument("--log", metavar="WHERE", help="figures to tensorboard:FOLDER or wandb:PROJECT")
 
 

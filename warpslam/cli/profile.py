@@ -14,6 +14,7 @@ from warpslam.config import Config
 from warpslam.errors import ConfigError, MeshError
 from warpslam.pipeline.finished import open_source
 from warpslam.pipeline.setup import as_configured, build_slam, load_kernels, select_frames
+from warpslam.profiling.report import fitted
 from warpslam.profiling.session import Profile
 from warpslam.runs.request import Source
 from warpslam.runtime.phases import phase
@@ -52,7 +53,7 @@ def _profile(options: argparse.Namespace) -> int:
         # Wide enough for every column, whoever reads it.
         console = Console(width=170)
     for table in profile.report.tables(0.0 if options.all else _MIN_SHARE):
-        console.print(table)
+        console.print(fitted(table, console.width))
     if options.json:
         Path(options.json).write_text(profile.to_json() + "\n", encoding="utf-8")
         print(f"figures     {options.json}")

@@ -127,8 +127,8 @@ class _View:
         return out
 
     def _batch(self, stride: int, samples: int) -> RayBatch:
-        width = -(-self.camera.width // stride)
-        return RayBatch(max(1, RAYS_PER_CHUNK // width) * width, samples, self.device)
+        width, height = -(-self.camera.width // stride), -(-self.camera.height // stride)
+        return RayBatch(min(height, max(1, RAYS_PER_CHUNK // width)) * width, samples, self.device)
 
     def _chunks(self, batch: RayBatch, stride: int, depth: np.ndarray | None) -> Iterator[tuple[int, int]]:
         """First row and number of rows of each part of a picture, whose rays are then in the batch."""

@@ -369,15 +369,20 @@ class LoopCloser:
 
     # -- told and saved ------------------------------------------------------------------------------------------
 
+    @property
+    def edges(self) -> list[tuple[int, int]]:
+        """Loops that hold: the frames of their two keyframes."""
+        frames = [keyframe.index for keyframe in self.tracker.keyframes]
+        return [(frames[i], frames[j]) for i, j in self.graph.loops]
+
     def account(self) -> dict[str, Any]:
         """Figures for metrics.json."""
-        frames = [keyframe.index for keyframe in self.tracker.keyframes]
-        edges = [[frames[i], frames[j]] for i, j in self.graph.loops]
-        apart = int((self.graph.parts(len(frames)) > 0).sum()) if frames else 0
+        count = len(self.tracker.keyframes)
+        apart = int((self.graph.parts(count) > 0).sum()) if count else 0
         return {
             **vars(self.figures),
             "apart_keyframes": apart,
-            "edges": edges,
+            "edges": [list(pair) for pair in self.edges],
             "seconds": self.seconds,
             "remapping_seconds": self.remapping_seconds,
         }

@@ -186,7 +186,7 @@ def import_gtsam() -> Any:
         import gtsam
     except ImportError:
         raise ConfigError(
-            'loops need the package gtsam: pip install "warpslam[loops]", or loops.enabled=false'
+            "loops need the package gtsam; type: pip install 'gtsam>=4.3', or set loops.enabled=false"
         ) from None
     return gtsam
 

@@ -90,7 +90,7 @@ class Recorder:
 
     def _where(self) -> tuple[str, int, bool]:
         """Phase, thread, and whether the phase was entered by it."""
-        thread, span = threading.get_ident(), phases.current()
+        thread, span = phases.thread_number(), phases.current()
         if thread not in self.recording.threads:
             self.recording.threads[thread] = threading.current_thread().name
         return (phases.OTHER, thread, False) if span is None else (span.path, thread, span.thread == thread)
@@ -134,7 +134,8 @@ class Recorder:
             original(kernel, timed, params, adjoint)
             left = clock()
             path, thread, own = self._where()
-            launch = Launch(_name(kernel, adjoint), path, thread, own, timed.start, timed.stop, work)
+            name, dim = _name(kernel, adjoint), _dimensions(params[0])
+            launch = Launch(name, path, thread, own, timed.start, timed.stop, work, dim)
             self.recording.launches.append(launch)
             self._add("profiler", entered, begun - entered)
             self._add("launch", begun, left - begun - (timed.stop - timed.start))
@@ -148,11 +149,11 @@ class Recorder:
             result = original(kernel, dim, *args, **kwargs)
             self._charge(start, before)
             if self._cuda is not None and result is None and wp.get_device(kwargs.get("device")).is_cuda:
-                threads = math.prod(dim) if isinstance(dim, tuple | list) else int(dim)
+                dim = tuple(map(int, dim)) if isinstance(dim, tuple | list) else (int(dim),)
                 inputs = kwargs.get("inputs", args[0] if args else ())
                 outputs = kwargs.get("outputs", args[1] if len(args) > 1 else ())
                 values = [*inputs, *outputs]
-                self._cuda.launched(kernel, bool(kwargs.get("adjoint")), threads, values)
+                self._cuda.launched(kernel, bool(kwargs.get("adjoint")), dim, values)
             return result
 
         return launch
@@ -163,7 +164,8 @@ class Recorder:
             original(command, stream)
             self._charge(start, before)
             if self._cuda is not None and command.device.is_cuda:
-                self._cuda.launched(command.kernel, command.adjoint, command.bounds.size, command.fwd_args or [])
+                dim, values = _dimensions(command.bounds), command.fwd_args or []
+                self._cuda.launched(command.kernel, command.adjoint, dim, values)
 
         return launch
 
@@ -236,7 +238,7 @@ class _CudaTimer:
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
-        self._pending: dict[str, deque[Work]] = defaultdict(deque)
+        self._pending: dict[str, deque[tuple[Work, tuple[int, ...]]]] = defaultdict(deque)
         recorder.recording.threads[GPU] = "GPU"
         self._begin()
 
@@ -244,10 +246,10 @@ class _CudaTimer:
         self._since = clock()
         wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
 
-    def launched(self, kernel: wp.Kernel, adjoint: bool, threads: int, values: list) -> None:
+    def launched(self, kernel: wp.Kernel, adjoint: bool, dim: tuple[int, ...], values: list) -> None:
         """Note a launch, whose time comes later."""
-        work = work_of(kernel, adjoint, threads, Arguments(kernel, values, readable=False))
-        self._pending[_name(kernel, adjoint)].append(work)
+        work = work_of(kernel, adjoint, math.prod(dim), Arguments(kernel, values, readable=False))
+        self._pending[_name(kernel, adjoint)].append((work, dim))
 
     def collect(self) -> None:
         """Charge the current phase with all kernels since the last time."""
@@ -267,11 +269,16 @@ class _CudaTimer:
             key = mangled.rpartition("_")[0]
             name = f"{key} (adjoint)" if kind.startswith("backward") else key
             waiting = self._pending.get(name)
-            name, work = (name, waiting.popleft()) if waiting else (mangled, NOTHING)
+            name, (work, dim) = (name, waiting.popleft()) if waiting else (mangled, (NOTHING, ()))
             stop = start + 1e-3 * result.elapsed
-            self._recorder.recording.launches.append(Launch(name, path, GPU, False, start, stop, work))
+            self._recorder.recording.launches.append(Launch(name, path, GPU, False, start, stop, work, dim))
             start = stop
         self._pending.clear()
+
+
+def _dimensions(bounds: Any) -> tuple[int, ...]:
+    """Of a launch."""
+    return tuple(bounds.shape)
 
 
 def _name(kernel: wp.Kernel, adjoint: bool) -> str:

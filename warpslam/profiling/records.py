@@ -8,7 +8,7 @@ from warpslam.profiling.costs import Work
 from warpslam.runtime.phases import Span
 
 GPU = 0
-"""Stands for a thread where a kernel ran on the device."""
+"""Stands for the number of a thread where a kernel ran on the device."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +20,7 @@ class Launch:
     path: str
     """Phase."""
     thread: int
-    """Identity of the thread it ran on, or `GPU`."""
+    """Number of the thread it ran on, or `GPU`."""
     own: bool
     """Whether that is the thread that entered the phase."""
     start: float
@@ -28,6 +28,8 @@ class Launch:
     stop: float
     """By `phases.clock` [s]."""
     work: Work
+    dim: tuple[int, ...] = ()
+    """Its dimensions; empty where a launch on the GPU is not told apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +41,7 @@ class Interval:
     path: str
     """Phase."""
     thread: int
-    """Identity of the thread."""
+    """Number of the thread."""
     own: bool
     """Whether that is the thread that entered the phase."""
     start: float
@@ -61,7 +63,7 @@ class Recording:
     spans: list[Span] = field(default_factory=list)
     """Stays in phases, likewise."""
     threads: dict[int, str] = field(default_factory=dict)
-    """Names of threads by identity."""
+    """Names of threads by number (`phases.thread_number`)."""
     start: float = 0.0
     """When it began, by `phases.clock` [s]."""
     wall_seconds: float = 0.0

@@ -1,4 +1,6 @@
-"""A profile as a trace: every launch on its thread, inside its phase, for Perfetto or chrome://tracing."""
+"""A profile as a trace: every launch, with its dimensions, on its thread, inside its phase, for Perfetto or
+chrome://tracing.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +33,8 @@ def write_trace(recording: Recording, path: Path) -> None:
         add(span.path.rpartition(" / ")[2], "phase", span.thread, span.start, span.stop - span.start)
     for launch in recording.launches:
         arguments: dict[str, Any] = {"phase": launch.path}
+        if launch.dim:
+            arguments["dim"] = list(launch.dim)
         if launch.work.points is not None:
             arguments["points"] = launch.work.points
         add(launch.kernel, "kernel", launch.thread, launch.start, launch.stop - launch.start, **arguments)

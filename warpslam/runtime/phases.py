@@ -6,6 +6,7 @@ them; what that thread hands to the launching module's workers stays in its phas
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from contextlib import ContextDecorator
@@ -24,7 +25,7 @@ class Span:
     """One stay in a phase.
 
     path: Names of the phase and of those around it, joined by " / ".
-    thread: Identity of the thread that entered it.
+    thread: Number of the thread that entered it (`thread_number`).
     start, stop: By `clock` [s].
     inner: Seconds spent in phases entered within, on the same thread.
     """
@@ -50,6 +51,16 @@ class PhaseListener(Protocol):
 
 listener: PhaseListener | None = None
 _current: ContextVar[Span | None] = ContextVar("warpslam_phase", default=None)
+_numbers = itertools.count(1)
+_thread = threading.local()
+
+
+def thread_number() -> int:
+    """Of this thread, from 1 on: no other one ever has it, while the system's identity is given again."""
+    number: int | None = getattr(_thread, "number", None)
+    if number is None:
+        number = _thread.number = next(_numbers)
+    return number
 
 
 def current() -> Span | None:
@@ -86,7 +97,7 @@ def enter(name: str) -> Span:
     """Begin a stay in a phase within the current one."""
     parent = _current.get()
     path = name if parent is None or parent.path == OTHER else f"{parent.path} / {name}"
-    span = Span(path, threading.get_ident(), parent)
+    span = Span(path, thread_number(), parent)
     span.token = _current.set(span)
     span.start = clock()
     return span

@@ -31,26 +31,27 @@ class FigureLog(Observer):
 
     Args:
         target: "tensorboard:FOLDER" or "wandb:PROJECT".
+        name: Of the run there; None for that of the sequence.
 
     Raises:
         ConfigError: The target is another one.
         MissingDependencyError: Its package is not installed.
     """
 
-    def __init__(self, target: str) -> None:
+    def __init__(self, target: str, name: str | None = None) -> None:
         kind, _, place = target.partition(":")
         if kind not in TARGETS or not place:
             raise ConfigError(f"--log {target}: give tensorboard:FOLDER or wandb:PROJECT")
         sinks: dict[str, Any] = {"tensorboard": _TensorBoard, "wandb": _WeightsAndBiases}
         self._open = sinks[kind]
-        self._place = place
+        self._place, self._name = place, name
         self._open.require()
         self._sink: Sink | None = None
         self._last = 0
 
     def begin(self, name: str) -> None:
-        """Open it, under the name of the sequence."""
-        self._sink = self._open(self._place, name)
+        """Open it."""
+        self._sink = self._open(self._place, self._name or name)
 
     def frame(self, progress: Progress) -> None:
         """Figures of a frame."""

@@ -18,6 +18,7 @@ from warpslam.pipeline.finished import frame_indices
 from warpslam.pipeline.setup import as_configured, load_slam, open_source
 from warpslam.report import RunData
 from warpslam.runs.folder import RunFolder
+from warpslam.viewer.loops import loop_lines
 from warpslam.viewer.page import Address, Page
 
 log = logging.getLogger(__name__)
@@ -61,8 +62,9 @@ class FinishedView:
         self._wanted = self._rendered = -1
         poses = self._data.poses
         self.page.place_camera(poses[0], self._data.statuses[0])
-        keyframes = [frame for frame in self._data.metrics.keyframes.frames or () if frame < len(poses)]
-        self.page.show_keyframes(poses[keyframes])
+        self._mapped = self._all_poses()
+        keyframes = [frame for frame in self._data.metrics.keyframes.frames or () if frame < len(self._mapped)]
+        self.page.show_keyframes(self._mapped[keyframes])
         if folder.mesh.is_file():
             mesh = load_mesh(folder.mesh)
             self.page.show_surface("whole", _Surface(mesh.vertices, mesh.faces, mesh.visual.vertex_colors))
@@ -71,13 +73,15 @@ class FinishedView:
         self._move(len(poses) - 1)
 
     def show(self, position: int) -> None:
-        """Show the frame at a position of the trajectory, and the path up to it."""
+        """Show the frame at a position of the trajectory, the path up to it, and the loops of that."""
         data = self._data
         position = int(np.clip(position, 0, len(data.poses) - 1))
         with self._lock:
             self._wanted, self._wanted_at = position, time.perf_counter()
             self.page.place_camera(data.poses[position], data.statuses[position])
             self.page.show_path(data.poses[: position + 1, :3, 3])
+            known = len(self._mapped) - len(data.poses) + position + 1
+            self.page.show_loops(loop_lines(data.metrics.loops.edges, self._mapped[:known, :3, 3]))
             seconds = data.timestamps[position] - data.timestamps[0]
             self.page.say(
                 f"**{data.name}**  \nframe {self._indices[position]} ({position + 1} of {len(data.poses)}) · "
@@ -123,6 +127,15 @@ class FinishedView:
         if ate is None or position not in ate.frame_indices:
             return ""
         return f" · error {100 * ate.errors[list(ate.frame_indices).index(position)]:.2f} cm"
+
+    def _all_poses(self) -> np.ndarray:
+        """Poses (N, 4, 4) of all frames that the map has seen: in a run that went on with a map, its frames come first,
+        and figures of keyframes count from them.
+        """
+        poses = self._data.poses
+        if self._slam is None or len(self._slam.trajectory.poses) < len(poses):
+            return poses
+        return np.asarray(self._slam.trajectory.poses)
 
     def _frame_indices(self) -> list[int]:
         try:

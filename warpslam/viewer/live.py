@@ -13,6 +13,7 @@ from warpslam.errors import MeshError, WarpSlamError
 from warpslam.frames import FrameStatus
 from warpslam.meshing.growing import GrowingMesh
 from warpslam.pipeline.observer import Observer
+from warpslam.viewer.loops import loop_lines, loops_of
 from warpslam.viewer.page import Address, Page
 
 if TYPE_CHECKING:
@@ -152,6 +153,7 @@ class LiveView(Observer):
         page.show_path(np.array(self._positions))
         keyframes = [keyframe.index for keyframe in getattr(self._method, "keyframes", [])]
         page.show_keyframes(trajectory.poses[keyframes])
+        page.show_loops(loop_lines(loops_of(self._method), trajectory.poses[:, :3, 3]))
         if progress.frame is not None:
             page.show_input(progress.frame.rgb)
         page.say(_figures(self._name, progress))

@@ -17,6 +17,7 @@ from warpslam.errors import ConfigError, MissingDependencyError
 from warpslam.frames import FrameStatus
 from warpslam.poses import vector_from_pose
 from warpslam.viewer.glb import glb
+from warpslam.viewer.loops import LOOP_COLOR
 
 log = logging.getLogger(__name__)
 
@@ -77,6 +78,7 @@ class Page:
         self._up = np.array([0.0, -1.0, 0.0])
         self._has_eye = False
         self._keyframes = np.zeros((0, 4, 4))
+        self._loops = np.zeros((0, 2, 3), np.float32)
         self._build(title)
 
     def _build(self, title: str) -> None:
@@ -96,7 +98,7 @@ class Page:
         self._rendering = gui.add_image(blank, label="rendering", format="jpeg", jpeg_quality=80, visible=False)
         self._follow = gui.add_checkbox("follow the camera", False)
         self._follow.on_update(lambda _: self._follow_camera())
-        for label, name in (("mesh", "/map"), ("path", "/path"), ("keyframes", "/keyframes")):
+        for label, name in (("mesh", "/map"), ("path", "/path"), ("keyframes", "/keyframes"), ("loops", "/loops")):
             self._add_switch(label, name)
 
     def _add_switch(self, label: str, name: str) -> None:
@@ -179,6 +181,18 @@ class Page:
             )  # fmt: skip
         for number in range(len(poses), len(before)):
             self._server.scene.remove_by_name(f"/keyframes/{number}")
+
+    def show_loops(self, lines: np.ndarray) -> None:
+        """Draw a line (L, 2, 3) between the two keyframes of each loop; sent where one is new or has moved."""
+        before, self._loops = self._loops, np.asarray(lines, np.float32).reshape(-1, 2, 3)
+        if len(before) == len(self._loops) and np.allclose(before, self._loops, atol=1e-3):
+            return
+        if not len(self._loops):
+            self._server.scene.remove_by_name("/loops/lines")
+            return
+        self._server.scene.add_line_segments(
+            "/loops/lines", self._loops, LOOP_COLOR, thickness=3.0, thickness_units="screen"
+        )
 
     def show_input(self, rgb: np.ndarray) -> None:
         """Show what the camera sees, uint8 (H, W, 3)."""

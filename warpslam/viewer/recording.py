@@ -13,6 +13,7 @@ from warpslam.evaluation import load_mesh
 from warpslam.frames import FrameStatus
 from warpslam.pipeline.observer import Observer
 from warpslam.poses import vector_from_pose
+from warpslam.viewer.loops import LOOP_COLOR, loop_lines, loops_of
 
 if TYPE_CHECKING:
     from warpslam.camera import Intrinsics
@@ -31,8 +32,9 @@ class RerunRecording(Observer):
     """Writes what a run comes to into an ``.rrd`` file, which `rerun FILE` shows.
 
     ``world/camera`` is the pose, ``world/camera/image`` and ``world/camera/depth`` what it saw (at most 320 px wide),
-    ``world/trajectory`` the path, ``world/keyframes`` theirs, ``world/ground_truth`` the true path, ``world/mesh`` the
-    mesh in the end; ``tracking/...`` are figures by frame. Timelines: ``frame`` (number in the sequence) and ``time``.
+    ``world/trajectory`` the path, ``world/keyframes`` theirs, ``world/loops`` a line between the two keyframes of each
+    loop, ``world/mesh`` the mesh in the end; ``tracking/...`` are figures by frame. Timelines: ``frame`` (number in the
+    sequence) and ``time``.
 
     Args:
         path: File to write.
@@ -53,7 +55,7 @@ class RerunRecording(Observer):
         self._stream = self._rerun.RecordingStream("warpslam")
         self._stream.save(str(self.path))
         self._method: Any = None
-        self._truth: list[np.ndarray] = []
+        self._loops = np.zeros((0, 2, 3), np.float32)
 
     def begin(self, name: str) -> None:
         """The recording has the name of the sequence."""
@@ -84,6 +86,10 @@ class RerunRecording(Observer):
         keyframes = [keyframe.index for keyframe in getattr(self._method, "keyframes", [])]
         if keyframes:
             stream.log("world/keyframes", rr.Points3D(trajectory.poses[keyframes][:, :3, 3], radii=0.01))
+        loops = loop_lines(loops_of(self._method), trajectory.poses[:, :3, 3])
+        if not np.array_equal(loops, self._loops):
+            self._loops = loops
+            stream.log("world/loops", rr.LineStrips3D(loops, colors=[LOOP_COLOR]))
         stream.log("tracking/inliers", rr.Scalars(result.inliers))
         stream.log("tracking/frames_per_second", rr.Scalars(progress.fps))
         if progress.ate_rmse is not None:
