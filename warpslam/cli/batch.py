@@ -139,10 +139,12 @@ def progress() -> Iterator[Callable[[JobStatus], None]]:
     if not sys.stdout.isatty():
         yield _Lines().show
         return
+    from rich.console import Console
     from rich.live import Live
 
     known: dict[str, JobStatus] = {}
-    with Live(_table([]), refresh_per_second=4) as live:
+    # rich's own console goes by what standard output was when it was first asked for.
+    with Live(_table([]), refresh_per_second=4, console=Console()) as live:
 
         def show(status: JobStatus) -> None:
             before = known.get(status.name)

@@ -33,6 +33,7 @@ def run_display() -> Iterator[Observer]:
     if not sys.stdout.isatty():
         yield Lines()
         return
+    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, TextColumn
     from rich.progress import Progress as Bar
     from rich.text import Text
@@ -49,7 +50,8 @@ def run_display() -> Iterator[Observer]:
         TextColumn("{task.fields[figures]}"), TimeLeft(),
     )  # fmt: skip
     # rich redirects stdout and stderr while the bar is up, so warnings appear above it.
-    with Bar(*columns) as bar:
+    # rich's own console goes by what standard output was when it was first asked for.
+    with Bar(*columns, console=Console()) as bar:
         yield RunBar(bar)
 
 

@@ -346,7 +346,9 @@ class Progress:
     """Frames a second, of the last frames."""
 
     seconds_left: float = 0.0
-    """Until everything is written, as far as can be told [s]; 0 where nobody knows: with a live camera, after the first frame."""
+    """Until everything is written, as far as can be told [s]; 0 where nobody knows: with a live camera, and after the
+    first frame.
+    """
 
     frame: Frame | None = None
     """What the method was given last."""
