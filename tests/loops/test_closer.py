@@ -137,6 +137,7 @@ def test_a_map_of_before_is_taken_up(frames, tmp_path):
 @pytest.mark.parametrize("name", ["loops_tracked_pairs", "loops_loop_transforms", "loops_tracked_covariances"])
 def test_damage_is_noticed(closed, name):
     header, arrays = state_arrays(closed.state())
+    assert state_from_arrays("map", header, arrays).loops is not None and len(arrays[name])
     damaged = arrays[name].copy()
     damaged.flat[0] = 10_000 if damaged.dtype == np.int64 else np.nan
     with pytest.raises(CheckpointError, match=name):
