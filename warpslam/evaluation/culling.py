@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -75,9 +76,13 @@ class Culling:
             rest = np.flatnonzero(~kept)
             rest = rest[visible_points(points[rest], virtual.poses, virtual.intrinsics, virtual.depths)]
             # Through a window a virtual camera sees the street: only what the frames were pointed at is asked for.
-            deepest = (np.full(np.shape(depth), np.max(depth)) for depth in frames.depths)
-            kept[rest] = visible_points(points[rest], frames.poses, frames.intrinsics, deepest)
+            kept[rest] = visible_points(points[rest], frames.poses, frames.intrinsics, self._deepest)
         return kept
+
+    @cached_property
+    def _deepest(self) -> list[np.ndarray]:
+        """Depth of the deepest point of each frame [m], of no axis."""
+        return [np.asarray(np.max(depth)) for depth in self.frames.depths]
 
     def may_keep(self, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
         """Which balls (N, 3), (N,) [m] may hold a point that counts, bool (N,); never wrong about one that does."""
@@ -109,42 +114,46 @@ def visible_points(
         points: World points [m], shape (N, 3).
         poses: Camera-to-world transforms, shape (F, 4, 4); a view with an unknown (NaN) pose is skipped.
         intrinsics: Camera of all views.
-        depths: One depth image (H, W) [m] a view, 0 = missing. With it a point counts only where it is no more than
-            ``tolerance`` behind the depth of its pixel; without it, wherever it projects into the image.
+        depths: One depth image (H, W) [m] a view, 0 = missing, or one depth for all of its pixels. With it a point
+            counts only where it is no more than ``tolerance`` behind the depth of its pixel; without it, wherever it
+            projects into the image.
         tolerance: Accepted distance behind the depth [m]; negative: it must lie that far in front of it.
     """
     import warp as wp
 
-    from warpslam.kernels.raycast import mark_seen_points
+    from warpslam.field.arrays import struct
+    from warpslam.kernels.raycast import DepthViews, mark_seen_points
     from warpslam.runtime.launching import Launcher, Step
 
     device = wp.get_device("cpu")
-    points = np.ascontiguousarray(points, dtype=np.float64)
-    seen = np.zeros(len(points), dtype=np.uint8)
-    given, marks = (wp.array(a, dtype=t, device=device, copy=False) for a, t in ((points, wp.vec3d), (seen, wp.uint8)))
-    k, launcher = intrinsics, Launcher(device)
-    depth_images = iter(depths) if depths is not None else None
-    for T_world_camera in np.asarray(poses, dtype=np.float64):
-        depth = np.zeros((0, 0)) if depth_images is None else next(depth_images)
-        if not np.isfinite(T_world_camera).all():
-            continue
-        inputs = [
-            given,
-            wp.mat33d(*T_world_camera[:3, :3].ravel()),
-            wp.vec3d(*T_world_camera[:3, 3]),
-            wp.vec2d(k.fx, k.fy),
-            wp.vec2d(k.cx, k.cy),
-            k.width,
-            k.height,
-            wp.array(np.ascontiguousarray(depth, np.float32), dtype=wp.float32, device=device, copy=False),
-            wp.float64(tolerance),
-            marks,
-        ]
+    poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
+    known = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))
+    images = [np.float32(np.inf)] * len(poses) if depths is None else list(depths)
+    images = [np.require(images[n], np.float32, "C") for n in known]
+    points, seen = np.ascontiguousarray(points, np.float64).reshape(-1, 3), np.zeros(len(points), np.uint8)
 
-        def steps(first: int, stop: int, slot: int, inputs: list = inputs) -> list[Step]:
-            return [(mark_seen_points, stop - first, [first, *inputs])]
+    def given(values: np.ndarray | list, dtype: type) -> wp.array:
+        return wp.array(values, dtype=dtype, device=device, copy=False)
 
-        launcher.slices(len(points), steps)
+    k = intrinsics
+    views = struct(
+        DepthViews,
+        rotation=given(np.ascontiguousarray(poses[known, :3, :3]), wp.mat33d),
+        origin=given(np.ascontiguousarray(poses[known, :3, 3]), wp.vec3d),
+        image=given(np.array([image.ctypes.data if image.ndim else 0 for image in images], np.uint64), wp.uint64),
+        reach=given(np.array([0.0 if image.ndim else image for image in images], np.float32), wp.float32),
+        focal=wp.vec2d(k.fx, k.fy),
+        center=wp.vec2d(k.cx, k.cy),
+        width=k.width,
+        height=k.height,
+    )
+    inputs = [given(points, wp.vec3d), views, wp.float64(tolerance), given(seen, wp.uint8)]
+
+    def steps(first: int, stop: int, slot: int) -> list[Step]:
+        return [(mark_seen_points, stop - first, [first, *inputs])]
+
+    if len(points) and len(known):
+        Launcher(device).slices(len(points), steps)
     return seen.astype(bool)
 
 

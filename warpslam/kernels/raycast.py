@@ -99,34 +99,53 @@ def render_mesh(
     )
 
 
+@wp.struct
+class DepthViews:
+    """Depth images of one camera: pixel (u, v) is entry v * width + u of what ``image`` points to, float32 [m], 0 =
+    missing; where that is 0, all pixels have the depth ``reach``.
+    """
+
+    rotation: wp.array[wp.mat33d]  # camera to world
+    origin: wp.array[wp.vec3d]
+    image: wp.array[wp.uint64]
+    reach: wp.array[float]
+    focal: wp.vec2d
+    center: wp.vec2d
+    width: int
+    height: int
+
+
+@wp.func_native("return ((const float*)views.image.data[view])[pixel];")
+def depth_at(views: DepthViews, view: int, pixel: int) -> float:
+    """Depth of a pixel [m]."""
+    ...
+
+
+@wp.func
+def sees(views: DepthViews, view: int, point: wp.vec3d, tolerance: wp.float64) -> bool:
+    """Whether a point lies in the image, and no more than ``tolerance`` behind the depth of its pixel."""
+    p = wp.transpose(views.rotation[view]) * (point - views.origin[view])
+    if not (p[2] > wp.float64(1.0e-6)):
+        return False
+    u = wp.rint(views.focal[0] * p[0] / p[2] + views.center[0])
+    v = wp.rint(views.focal[1] * p[1] / p[2] + views.center[1])
+    # Asked so that a NaN is not inside.
+    inside = u >= wp.float64(0.0) and u < wp.float64(views.width) and v >= wp.float64(0.0)
+    if not (inside and v < wp.float64(views.height)):
+        return False
+    depth = views.reach[view]
+    if views.image[view] != wp.uint64(0):
+        depth = depth_at(views, view, int(v) * views.width + int(u))
+    return depth > 0.0 and p[2] <= wp.float64(depth) + tolerance
+
+
 @wp.kernel
 def mark_seen_points(
-    first: int,
-    points: wp.array[wp.vec3d],
-    rotation: wp.mat33d,  # camera to world
-    origin: wp.vec3d,
-    focal: wp.vec2d,
-    center: wp.vec2d,
-    width: int,
-    height: int,
-    depth: wp.array2d[wp.float32],  # (H, W) [m], 0 = missing; empty: whatever is in the image is seen
-    tolerance: wp.float64,
-    seen: wp.array[wp.uint8],
+    first: int, points: wp.array[wp.vec3d], views: DepthViews, tolerance: wp.float64, seen: wp.array[wp.uint8]
 ):
-    """Mark a point, of those from ``first`` on, that lies no more than ``tolerance`` behind the depth of its pixel."""
+    """Mark the points, from ``first`` on, that any of the views sees (CPU: images are pointers to its memory)."""
     tid = first + wp.tid()
-    if seen[tid] != wp.uint8(0):
-        return
-    p = wp.transpose(rotation) * (points[tid] - origin)
-    if not (p[2] > wp.float64(1.0e-6)):
-        return
-    u = wp.rint(focal[0] * p[0] / p[2] + center[0])
-    v = wp.rint(focal[1] * p[1] / p[2] + center[1])
-    # Not what is left where none is outside: a NaN is not inside either.
-    if not (u >= wp.float64(0.0) and u < wp.float64(width) and v >= wp.float64(0.0) and v < wp.float64(height)):
-        return
-    if depth.shape[0] > 0:
-        surface = depth[int(v), int(u)]
-        if not (surface > 0.0 and p[2] <= wp.float64(surface) + tolerance):
+    for view in range(views.image.shape[0]):
+        if sees(views, view, points[tid], tolerance):
+            seen[tid] = wp.uint8(1)
             return
-    seen[tid] = wp.uint8(1)

@@ -23,7 +23,7 @@ _PROBE_RAYS = 400, 2500  # of two views: a launch costs the same for any number,
 _USUAL_KEYFRAMES, _USUAL_FRAMES = 2, 30  # so many in so many: what is expected before there are frames to go by
 _MESHING = 0.15  # of the time that rendering the panels takes
 # [s]. Neither the map nor its device has a part in these.
-_EVALUATION, _EVALUATION_A_FRAME = 8.0, 0.2
+_EVALUATION, _EVALUATION_A_FRAME = 6.0, 0.08
 _PLOTS = 4.0  # mesh views and the report, too
 
 
