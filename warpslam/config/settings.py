@@ -106,8 +106,8 @@ class TrackingConfig(_Group):
     )
     filter_by: Literal["depth", "loss"] = Field(
         "depth",
-        description="the residual that dynamic_filter goes by: depth alone (released code), or the whole loss of Eq. 12, "
-        "colour included (paper)",
+        description="the residual that dynamic_filter goes by: depth alone (released code), or the whole loss of "
+        "Eq. 12, colour included (paper)",
     )
     median_includes_missing: bool = Field(
         False, description="rays without depth count in the median, as in the released code"
