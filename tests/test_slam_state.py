@@ -107,15 +107,14 @@ def test_free_space_goes_on_after_a_restart(frames, layout):
     state of before there was that setting has noise.
     """
     overrides = ("grid.middle_start=free", f"grid.layout={layout}", "grid.margin=0.1", "mapping.every=1")
-    whole = run(frames[:3], *overrides)
+    whole = run(frames[:1], *overrides)
     header, arrays = state_arrays(whole.state())
     again = Slam.from_state(state_from_arrays("map", header, arrays), "cpu")
-    extents = []
+    rows = whole.scene.grids["middle"].row_count
     for slam in (whole, again):
-        for frame in frames[7:]:
-            extents.append(slam.scene.grids["middle"].row_count)
+        for frame in frames[1::4]:
             slam.step(frame.rgb, frame.depth, frame.timestamp)
-    assert extents[-1] > extents[0]
+        assert slam.scene.grids["middle"].row_count > rows
     for name, array in state_arrays(whole.state())[1].items():
         np.testing.assert_array_equal(state_arrays(again.state())[1][name], array, err_msg=name)
     del header["config"]["grid"]["middle_start"], header["config"]["tracking"]["coarse_term"]
