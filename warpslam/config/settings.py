@@ -120,7 +120,8 @@ class TrackingConfig(_Group):
     coarse_term: bool = Field(
         False,
         description="rays that end where no mapped frame has measured anything get the coarse term of Eq. 11 (paper): "
-        "the depth that the coarse level forecasts; needs optimizer adam, mapping.loss rendering and mapping.coarse",
+        "the depth that the coarse level forecasts; needs optimizer adam, mapping.loss rendering and mapping.coarse, "
+        "with 500 first iterations or more, for before these the coarse level is opaque",
     )
     constant_speed: bool = Field(True, description="start from the last motion instead of the last pose")
     keep_best: Literal["last", "fixed_pixels"] = Field(
