@@ -179,6 +179,67 @@ def test_tracking_goes_by_what_was_seen(frames):
     assert next_result(paper, 0.0)[2] == "OK"
 
 
+def test_coarse_term_where_nothing_was_seen(frames):
+    """Half of what was seen forgotten: the rays into the other half join the loss of tracking by the coarse level, in
+    its descent and in its judgement; with everything seen, none do and the pose is the same to the bit.
+    """
+
+    def next_pose(share: float, *overrides: str) -> tuple[np.ndarray, Slam]:
+        slam = run(frames[:1], "tracking.optimizer=adam", "mapping.loss=rendering", *overrides)
+        seen = slam.scene.grids["color"].seen
+        flags = np.ones_like(seen.numpy())
+        flags[int(share * len(flags)) :] = 0
+        seen.assign(flags)
+        slam.step(frames[1].rgb, frames[1].depth)
+        return slam.history.pose(1), slam
+
+    on = "tracking.coarse_term=true"
+    whole, _ = next_pose(1.0)
+    forecast, slam = next_pose(1.0, on)
+    np.testing.assert_array_equal(forecast, whole)
+    assert not slam.tracker._forecast.inlier.numpy().any()
+    half, _ = next_pose(0.5)
+    forecast, slam = next_pose(0.5, on)
+    assert np.abs(forecast - half).max() > 1e-5
+    rays, others = (batch.inlier.numpy() != 0 for batch in (slam.tracker._forecast, slam.tracker._batch))
+    assert rays.any() and others.any() and not (rays & others).any()
+    np.testing.assert_array_equal(
+        slam.tracker._forecast.measured_depth.numpy(), slam.tracker._batch.measured_depth.numpy()
+    )
+    assert slam.tracker._judged.numpy()[0, -1, 1] > 0
+
+
+def test_settings_of_the_papers_tracking_loss_need_it():
+    """What the coarse term and the filter by Eq. 12 can't do without is named, with the remedy; given poses ask for
+    nothing.
+    """
+    on, by_loss = "tracking.coarse_term=true", "tracking.filter_by=loss"
+    for overrides, message in (
+        ([on], "optimizer=adam"),
+        ([on, BY_RENDERING], "optimizer=adam"),
+        ([on, "tracking.optimizer=adam"], "mapping.loss=rendering"),
+        ([on, "tracking.optimizer=adam", "mapping.loss=rendering", "mapping.coarse=false"], "mapping.coarse=true"),
+        ([by_loss], "gauss_newton"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            new_slam(*overrides)
+    new_slam(on, by_loss, "tracking.use_given_poses=true")
+    new_slam(by_loss, BY_RENDERING)
+
+
+def test_filter_by_the_whole_loss(frames):
+    """With the filter of Eq. 12 what was inlier by depth alone is not, where colour is wrong."""
+
+    def inliers(*overrides: str) -> int:
+        slam = run(frames[:1], BY_RENDERING, "tracking.dynamic_filter=1.5", "tracking.color_weight=5", *overrides)
+        rgb = frames[1].rgb.copy()
+        rgb[:, :40] = 255 - rgb[:, :40]
+        slam.step(rgb, frames[1].depth)
+        return int(slam.tracker._batch.inlier.numpy().sum())
+
+    assert inliers("tracking.filter_by=loss") != inliers()
+
+
 def test_given_poses_start_the_map_from_depth(frames):
     """Under the rendering loss: where poses are given, vertices start from the depth unless the settings say no; where
     they are not, only if the settings say so.

@@ -103,6 +103,28 @@ def test_saved_at_bad_moments_it_goes_on_exactly(frames, monkeypatch, forgotten)
             np.testing.assert_array_equal(arrays[name], array, err_msg=f"{name}, from frame {first} on")
 
 
+@pytest.mark.parametrize("layout", ["dense", "blocks"])
+def test_free_space_goes_on_after_a_restart(frames, layout):
+    """With middle features that begin as free space a run from a state in its midst is the whole run, to the bit; a
+    state of before there was that setting has noise.
+    """
+    overrides = ("grid.middle_start=free", f"grid.layout={layout}", "grid.margin=0.1", "mapping.every=1")
+    whole = run(frames[:1], *overrides)
+    header, arrays = state_arrays(whole.state())
+    again = Slam.from_state(state_from_arrays("map", header, arrays), "cpu")
+    rows = whole.scene.grids["middle"].row_count
+    for slam in (whole, again):
+        for frame in frames[1::4]:
+            slam.step(frame.rgb, frame.depth, frame.timestamp)
+        assert slam.scene.grids["middle"].row_count > rows
+    for name, array in state_arrays(whole.state())[1].items():
+        np.testing.assert_array_equal(state_arrays(again.state())[1][name], array, err_msg=name)
+    del header["config"]["grid"]["middle_start"], header["config"]["tracking"]["coarse_term"]
+    del header["config"]["tracking"]["filter_by"]
+    older = Slam.from_state(state_from_arrays("map", header, arrays), "cpu").config
+    assert (older.grid.middle_start, older.tracking.coarse_term, older.tracking.filter_by) == ("noise", False, "depth")
+
+
 def test_frame_that_was_nowhere_can_be_saved(frames, tmp_path):
     """A camera that could not be compared with anything has no depth error, and the state is saved as any other."""
     slam = run(frames[:2], "tracking.optimizer=gauss_newton")

@@ -337,3 +337,26 @@ def check_settings(camera: Intrinsics, config: Config) -> None:
         )
     if tracking.use_given_poses and config.keyframes.policy == "information_gain":
         raise ConfigError("keyframes.policy = information_gain needs tracking; use interval with given poses")
+    if not tracking.use_given_poses:
+        _check_tracking_loss(config)
+
+
+def _check_tracking_loss(config: Config) -> None:
+    """Whether the other settings have what the terms of Eq. 11-12 need.
+
+    Raises:
+        ConfigError: They have not.
+    """
+    tracking, mapping = config.tracking, config.mapping
+    if tracking.coarse_term and tracking.optimizer != "adam":
+        raise ConfigError(
+            f"tracking.coarse_term is a term of the paper's loss, which tracking.optimizer = {tracking.optimizer} does "
+            "not descend: --set tracking.optimizer=adam"
+        )
+    if tracking.coarse_term and mapping.enabled and not (mapping.coarse and mapping.loss == "rendering"):
+        raise ConfigError(
+            "tracking.coarse_term needs the coarse level while the camera moves, and here it is formed at the end or "
+            "not at all: --set mapping.loss=rendering mapping.coarse=true"
+        )
+    if tracking.filter_by == "loss" and tracking.optimizer == "direct":
+        raise ConfigError("tracking.filter_by = loss needs tracking.optimizer = adam or gauss_newton")

@@ -51,6 +51,14 @@ def test_paper_presets_hold_what_our_defaults_change(name):
         assert config.mapping.active_share == 0.0 and config.mapping.first_iterations == 1500
 
 
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_terms_of_the_paper_that_the_code_lacks_are_off(name):
+    """Every preset, the published ones included, tracks and begins as before they could be turned on."""
+    config = Config.from_preset(name)
+    assert not config.tracking.coarse_term and config.tracking.filter_by == "depth"
+    assert config.grid.middle_start == "noise"
+
+
 def test_unknown_preset_lists_the_known():
     """The error offers the choices."""
     with pytest.raises(ConfigError, match="replica"):

@@ -92,6 +92,7 @@ class Iteration:
         self.batch.measured_depth.assign(rays.depth)
         self.batch.measured_rgb.assign(rays.rgb)
         self.poses = wp.array(rays.poses, dtype=float, device=device, requires_grad=True)
+        self.dropped: np.ndarray | None = None
         self.places = {
             level: wp.array(np.arange(len(grid.rows)), dtype=int, device=device) for level, grid in source.grids.items()
         }
@@ -100,6 +101,8 @@ class Iteration:
         """Rays, the pre-filter and the samples; the coarse stage filters by depth, too, and then ignores it."""
         self.batch.cast(self.poses)
         self.batch.bound(self.arrays)
+        if self.dropped is not None:
+            self.batch.keep.assign(np.where(self.dropped, 0, self.batch.keep.numpy()))
         self.batch.place_samples(oracle.STRATIFIED_COUNT, oracle.SURFACE_COUNT, use_depth=self.stage != "coarse")
 
     def render(self, gradients: Gradients | None = None, tape: wp.Tape | None = None) -> None:
@@ -111,7 +114,7 @@ class Iteration:
         error below that multiple of the median move the poses.
         """
         self.poses.grad.zero_()
-        gradients = self._wanted(MAPPED_LEVELS[self.stage], points=self.stage != "coarse")
+        gradients = self._wanted(MAPPED_LEVELS[self.stage], points=True)
         gradients.inliers_move = filter_factor > 0
         with self.batch.launcher.tape() as tape:
             self.cast_and_sample()
@@ -124,17 +127,36 @@ class Iteration:
         weights = {}
         if gradients.color_weights is not None:
             weights = self._named_weight_gradient(gradients.color_weights.numpy().sum(axis=0))
-        poses = self.poses.grad.numpy().copy() if gradients.points else None
+        poses = self.poses.grad.numpy().copy()
         return Gradient(float(self.batch.loss.numpy()[0]), rows, weights, poses)
 
-    def tracking(self, *, filter_factor: float = 10.0, median_includes_missing: bool = True) -> Gradient:
-        """Tracking loss and the gradient of the poses alone."""
+    def tracking(
+        self,
+        *,
+        filter_factor: float = 10.0,
+        median_includes_missing: bool = True,
+        filter_by_loss: bool = False,
+        forecast: Iteration | None = None,
+    ) -> Gradient:
+        """Tracking loss and the gradient of the poses alone.
+
+        forecast: Of the coarse stage and of this one's poses and launcher: rays that add the coarse term of Eq. 11.
+        """
         self.poses.grad.zero_()
         with self.batch.launcher.tape() as tape:
             self.cast_and_sample()
             self.render(Gradients(points=True), tape)
-            choose_inliers(self.batch, filter_factor, median_includes_missing=median_includes_missing)
-            tracking_loss(self.batch, 0.5)
+            choose_inliers(
+                self.batch,
+                filter_factor,
+                median_includes_missing=median_includes_missing,
+                color_weight=0.5 if filter_by_loss else 0.0,
+            )
+            if forecast is not None:
+                forecast.cast_and_sample()
+                forecast.render(Gradients(points=True), tape)
+                choose_inliers(forecast.batch, filter_factor)
+            tracking_loss(self.batch, 0.5, None if forecast is None else forecast.batch)
         tape.backward(self.batch.loss)
         return Gradient(float(self.batch.loss.numpy()[0]), poses=self.poses.grad.numpy().copy())
 

@@ -111,8 +111,7 @@ def test_mapping_gradients(device, stage, seed):
             check_rows(
                 gradient.color_decoder[name].reshape(len(weights), -1), weights.grad.reshape(len(weights), -1), name
             )
-    if stage != "coarse":
-        check_rows(gradient.poses, expected.poses.grad, "poses")
+    check_rows(gradient.poses, expected.poses.grad, "poses")
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -139,17 +138,23 @@ def test_only_fitting_rays_move_poses(device, seed):
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("filter_factor", (10.0, 0.7, 0.0), ids=lambda f: f"filter{f}")
 @pytest.mark.parametrize("median_includes_missing", (True, False), ids=("all", "valid"))
-def test_tracking_gradients(device, seed, filter_factor, median_includes_missing):
-    """Residuals, inliers, loss and the gradient of both poses agree, with either median and without the filter."""
+@pytest.mark.parametrize("filter_by_loss", (False, True), ids=("depth", "loss"))
+def test_tracking_gradients(device, seed, filter_factor, median_includes_missing, filter_by_loss):
+    """Residuals, inliers, loss and the gradient of both poses agree, with either median and without the filter, which
+    goes by depth or by the whole loss of Eq. 12.
+    """
     expected = Expected(seed, "color")
     run = Iteration(expected.field, expected.rays, "color", device)
-    gradient = run.tracking(filter_factor=filter_factor, median_includes_missing=median_includes_missing)
+    gradient = run.tracking(
+        filter_factor=filter_factor, median_includes_missing=median_includes_missing, filter_by_loss=filter_by_loss
+    )
     tracking = oracle.tracking_loss(
         expected.rendering,
         expected.depth,
         expected.rgb,
         filter_factor=filter_factor,
         median_over_valid=not median_includes_missing,
+        filter_by_loss=filter_by_loss,
     )
     tracking.loss.backward()
     inlier = np.zeros(len(expected.kept), bool)
@@ -157,11 +162,55 @@ def test_tracking_gradients(device, seed, filter_factor, median_includes_missing
     if filter_factor == 0.7:
         assert inlier.sum() < (expected.depth > 0).sum()
     assert np.array_equal(run.array("inlier") != 0, inlier)
-    np.testing.assert_allclose(
-        run.array("residual")[inlier], tracking.residual[tracking.keep].detach().numpy(), rtol=1e-3, atol=1e-5
-    )
+    residual = tracking.residual.detach()
+    if filter_by_loss:
+        residual = residual + 0.5 * (expected.rgb - expected.rendering.rgb).detach().abs().sum(dim=1)
+    np.testing.assert_allclose(run.array("residual")[inlier], residual[tracking.keep].numpy(), rtol=1e-3, atol=1e-5)
     assert gradient.loss == pytest.approx(tracking.loss.item(), rel=1e-4)
     check_rows(gradient.poses, expected.poses.grad, "poses")
+
+
+def test_the_loss_filters_what_depth_does_not(device):
+    """A ray whose colour alone is wrong, and by much, stays an inlier by depth and is none by Eq. 12."""
+    expected = Expected(SEEDS[0], "color")
+    run = Iteration(expected.field, expected.rays, "color", device)
+    run.tracking()
+    ray = np.flatnonzero(run.array("inlier"))[0]
+    rgb = run.batch.measured_rgb.numpy()
+    rgb[ray] = 1e4
+    run.batch.measured_rgb.assign(rgb)
+    for filter_by_loss in (False, True):
+        run.tracking(filter_by_loss=filter_by_loss)
+        assert run.array("inlier")[ray] == (not filter_by_loss)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_coarse_term(device, seed):
+    """Rays that are left out of the fine and colour terms add |D - D^c| / sqrt(V^c) (Eq. 11), with a gradient by both
+    poses, and nothing else.
+    """
+    fine, coarse = Expected(seed, "color"), Expected(seed, "coarse")
+    run = Iteration(fine.field, fine.rays, "color", device)
+    forecast = Iteration(coarse.field, coarse.rays, "coarse", device)
+    forecast.batch.launcher, forecast.poses = run.batch.launcher, run.poses
+    is_forecast = np.arange(run.count) % 3 == 0
+    run.dropped, forecast.dropped = is_forecast, ~is_forecast
+    gradient = run.tracking(filter_factor=0.0, forecast=forecast)
+
+    def terms(expected: Expected, mask: np.ndarray, color_weight: float) -> torch.Tensor:
+        part, rendering = torch.tensor(mask[expected.kept]), expected.rendering
+        part = part & (expected.depth > 0)
+        error = (expected.depth - rendering.depth).abs() / torch.sqrt(rendering.variance.detach() + 1e-10)
+        return error[part].sum() + color_weight * (expected.rgb - rendering.rgb).abs()[part].sum()
+
+    seen, unseen = terms(fine, ~is_forecast, 0.5), terms(coarse, is_forecast, 0.0)
+    (seen + unseen).backward()
+    assert unseen.item() > 0.02 * seen.item()
+    assert gradient.loss == pytest.approx((seen + unseen).item(), rel=1e-4)
+    check_rows(gradient.poses, fine.poses.grad + coarse.poses.grad, "poses")
+    # The fine terms pull harder: what the coarse one adds is looked at alone.
+    without = run.tracking(filter_factor=0.0)
+    check_rows(gradient.poses - without.poses, coarse.poses.grad, "coarse part")
 
 
 def test_adam_on_rows(device):

@@ -84,6 +84,13 @@ def test_tracking_gradients_agree(scene):
     assert np.linalg.norm(b.poses - a.poses) < 1e-4 * np.linalg.norm(a.poses)
 
 
+def test_coarse_gradients_agree(scene):
+    """Of the coarse level's rows, and of the pose, which the coarse term of tracking asks for."""
+    a, b = (iteration.mapping() for iteration in iterations(scene, "coarse").values())
+    assert np.linalg.norm(b.rows["coarse"] - a.rows["coarse"]) < 1e-4 * np.linalg.norm(a.rows["coarse"])
+    assert np.linalg.norm(b.poses - a.poses) < 1e-4 * np.linalg.norm(a.poses)
+
+
 def test_gauss_newton_steps_agree(scene):
     """The step from sums of parts is that of one thread; it goes somewhere, and again from where it came to."""
     poses = []

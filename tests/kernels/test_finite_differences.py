@@ -111,7 +111,7 @@ def test_color_decoder(make, device):
     check(tensors[name], gradient[name], lambda B: assign(**{name: B}), lambda: loss_of(run), step=0.01)
 
 
-@pytest.mark.parametrize("stage", ("middle", "fine", "color"))
+@pytest.mark.parametrize("stage", ("coarse", "middle", "fine", "color"))
 def test_poses_in_mapping(make, stage):
     """The change of the mapping loss when the cameras move, at fixed sample depths."""
     run = make(stage)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import warp as wp
@@ -44,8 +46,13 @@ def mark(scene_map: SceneMap, depth: np.ndarray) -> np.ndarray:
     return grid.seen.numpy() != 0
 
 
-def kept(arrays: FieldArrays, device: wp.Device, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rays of a camera at the origin: which are kept (n,), their measured depth (n,), and where they meet the wall."""
+def kept(
+    arrays: FieldArrays, device: wp.Device, depth: np.ndarray, *, unseen: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rays of a camera at the origin: which are kept (n,), their measured depth (n,), and where they meet the wall.
+
+    unseen: Keep those that are otherwise left out.
+    """
     pool = ImagePool(CAMERA, device)
     pool.set(0, np.full((CAMERA.height, CAMERA.width, 3), 128, np.uint8), depth)
     batch = RayBatch(RAYS, 4, device)
@@ -54,7 +61,7 @@ def kept(arrays: FieldArrays, device: wp.Device, depth: np.ndarray) -> tuple[np.
     batch.cast(wp.array(vector_from_pose(np.eye(4))[None], dtype=float, device=device))
     batch.bound(arrays)
     assert batch.keep.numpy().all()
-    batch.drop_unseen(arrays)
+    (batch.keep_unseen if unseen else batch.drop_unseen)(arrays)
     return batch.keep.numpy() != 0, batch.measured_depth.numpy(), WALL * batch.direction.numpy()
 
 
@@ -84,6 +91,18 @@ def test_rays_into_what_nobody_measured_are_left_out(scene_map, device):
     assert not keep[point[:, 0] > 0.33].any()
     keep, depth, _ = kept(arrays, device, wall_with_hole())
     assert keep[depth == 0].all() and (depth == 0).any()
+
+
+def test_rays_of_the_coarse_term_are_those_left_out(scene_map, device):
+    """Every ray with depth is kept for one of both purposes; a map that was seen everywhere leaves none."""
+    mark(scene_map, wall_with_hole())
+    arrays, full = scene_map.arrays(), np.full_like(wall_with_hole(), WALL)
+    seen, unseen = (kept(arrays, device, full, unseen=unseen)[0] for unseen in (False, True))
+    assert seen.any() and unseen.any()
+    np.testing.assert_array_equal(seen, ~unseen)
+    keep, depth, _ = kept(arrays, device, wall_with_hole(), unseen=True)
+    assert keep.any() and not keep[depth == 0].any()
+    assert not kept(dataclasses.replace(arrays, seen=None), device, full, unseen=True)[0].any()
 
 
 def test_growth_keeps_what_was_seen(scene_map):

@@ -7,8 +7,9 @@ import warp as wp
 from warpslam.camera import Intrinsics
 from warpslam.field.decoder_files import load_decoders
 from warpslam.field.decoders import random_decoders
+from warpslam.field.feature_fit import logit_and_derivative
 from warpslam.kernels.grid import Vec32
-from warpslam.mapping.depth_start import TRUNCATION, DepthStart, fit_signed_distance, logit_and_derivative
+from warpslam.mapping.depth_start import TRUNCATION, DepthStart, fit_signed_distance
 from warpslam.mapping.frustum import REACH
 from warpslam.scene.feature_grid import FeatureGrid
 

@@ -113,7 +113,7 @@ def test_a_frozen_level_stays_as_it_began(frames, frozen):
     """The other levels are optimised, and the coarse one waits for the end."""
     slam = step(new(f"mapping.optimize_{frozen}=false"), frames[:2])
     for level, grid in slam.scene.grids.items():
-        initial = new_grid(level, slam.config.grid, slam.seed, slam.device)
+        initial = new_grid(level, slam.config.grid, slam.seed, slam.device, slam.scene.decoder_weights)
         initial.update_from(grid, None)
         is_same = np.array_equal(initial.state().features, grid.state().features)
         assert is_same == (level in ("coarse", frozen)), level

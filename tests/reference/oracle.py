@@ -272,8 +272,11 @@ def tracking_loss(
     color_weight: float = 0.5,
     filter_factor: float = 10.0,
     median_over_valid: bool = False,
+    filter_by_loss: bool = False,
 ) -> TrackingLoss:
     """Eq. 11-12 as sums, with the variance held constant.
+
+    The authors' filter goes by the depth residual; ``filter_by_loss`` has it go by the ray's whole loss (Sec. 3.3).
 
     The authors take the (lower) median over all rays, also those without depth; ``median_over_valid`` leaves these out.
     A ``filter_factor`` of 0 keeps every ray with depth.
@@ -282,8 +285,11 @@ def tracking_loss(
     valid = depth > 0
     keep = valid
     if filter_factor > 0:
-        judged = residual.detach()[valid] if median_over_valid else residual.detach()
-        keep = valid & (residual.detach() < filter_factor * judged.median())
+        value = residual.detach()
+        if filter_by_loss:
+            value = value + color_weight * (rgb - rendering.rgb).abs().sum(dim=1).detach()
+        judged = value[valid] if median_over_valid else value
+        keep = valid & (value < filter_factor * judged.median())
     loss = residual[keep].sum() + color_weight * (rgb - rendering.rgb).abs()[keep].sum()
     return TrackingLoss(loss, residual, keep)
 

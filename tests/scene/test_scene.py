@@ -5,9 +5,12 @@ import pytest
 import warp as wp
 
 from warpslam.config import GridConfig
-from warpslam.errors import InputError, MapSizeError
+from warpslam.errors import CheckpointError, InputError, MapSizeError
+from warpslam.field.decoder_files import load_decoders
 from warpslam.field.decoders import random_decoders
+from warpslam.field.feature_fit import MAX_FREE_LOGIT, free_feature
 from warpslam.runtime.environment import free_gigabytes
+from warpslam.scene.block_grid import BlockGrid
 from warpslam.scene.scene_map import SceneMap
 
 DEVICES = ["cpu", *(str(d) for d in wp.get_cuda_devices())]
@@ -63,6 +66,50 @@ def test_spacing_is_exact():
     for grid in scene.grids.values():
         np.testing.assert_allclose(np.array(grid.lattice.origin), grid.first * grid.spacing, atol=1e-6)
         np.testing.assert_allclose(1.0 / np.array(grid.lattice.inverse_spacing), grid.spacing, rtol=1e-6)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("layout", ("dense", "blocks"))
+def test_middle_level_begins_as_free_space(device, layout):
+    """A.2: every middle vertex has the one vector, wherever and whenever it is made, in a copy, after a restart and
+    when it begins again; the field is free there; other levels are as ever.
+    """
+    decoders, other = load_decoders(), random_decoders(0)
+    free = GridConfig(layout=layout, middle_start="free")
+    scene = SceneMap(decoders, free, wp.get_device(device), seed=3)
+    noise = SceneMap(decoders, GridConfig(layout=layout), wp.get_device(device), seed=3)
+    expected = free_feature(decoders.middle)
+
+    def vertices(scene: SceneMap) -> np.ndarray:
+        grid = scene.grids["middle"]
+        if isinstance(grid, BlockGrid):
+            grid.make(grid.wanted_in_box(scene.low, 0.3 * scene.low))
+        return grid.features.numpy()[: grid.row_count]
+
+    scene.cover(np.full(3, -0.5), np.full(3, 0.5))
+    assert (vertices(scene) == expected).all()
+    restored = SceneMap(decoders, free, wp.get_device(device), seed=3)
+    restored.restore(scene.state())
+    for one in (scene, restored, scene.copy()):
+        one.cover(np.array([-2.0, -0.5, -0.5]), np.array([0.5, 1.5, 0.5]))
+        assert (vertices(one) == expected).all()
+    grid = scene.grids["middle"]
+    own = np.arange(grid.row_count - grid.own_rows, grid.row_count)
+    grid.features.fill_(7.0)
+    grid.renew(own)
+    assert (grid.features.numpy()[own] == expected).all()
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3))
+    assert restored.query_occupancy(points, "middle").max() < MAX_FREE_LOGIT
+    assert restored.query_occupancy(points).max() < MAX_FREE_LOGIT
+    noise.cover(np.full(3, -0.5), np.full(3, 0.5))
+    noise.cover(np.array([-2.0, -0.5, -0.5]), np.array([0.5, 1.5, 0.5]))
+    assert noise.query_occupancy(points, "middle").max() > MAX_FREE_LOGIT
+    for level in ("coarse", "fine", "color"):
+        rows = noise.grids[level].row_count
+        ours, theirs = (one.grids[level].features.numpy()[:rows] for one in (restored, noise))
+        np.testing.assert_array_equal(ours, theirs)
+    with pytest.raises(CheckpointError, match="middle_start"):
+        SceneMap(other, free, wp.get_device(device))
 
 
 def test_refuses_to_grow_beyond_the_memory_limit():

@@ -116,7 +116,7 @@ def outside_change(job: Job) -> dict[str, Any]:
 
     def snapshot(level: str) -> FeatureGrid:
         grid = slam.scene.grids[level]
-        copy = new_grid(level, slam.config.grid, slam.seed, device)
+        copy = new_grid(level, slam.config.grid, slam.seed, device, slam.scene.decoder_weights)
         copy.restore(grid.state())
         return copy
 

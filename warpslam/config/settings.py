@@ -35,6 +35,11 @@ class GridConfig(_Group):
     middle_spacing: float = Field(0.32, gt=0, description="vertex spacing of the middle level [m]")
     fine_spacing: float = Field(0.08, gt=0, description="vertex spacing of the fine level [m]; the paper has 0.16")
     color_spacing: float = Field(0.08, gt=0, description="vertex spacing of the colour grid [m]; the paper has 0.16")
+    middle_start: Literal["noise", "free"] = Field(
+        "noise",
+        description="middle features begin as noise (paper), or all as the one vector that the decoder reads as free "
+        "space (A.2, which has it for one figure)",
+    )
     coarse_std: float = Field(0.01, ge=0, description="standard deviation of the initial coarse features")
     middle_std: float = Field(0.01, ge=0, description="standard deviation of the initial middle features")
     fine_std: float = Field(0.0001, ge=0, description="standard deviation of the initial fine features")
@@ -102,6 +107,11 @@ class TrackingConfig(_Group):
     dynamic_filter: float = Field(
         10.0, ge=0, description="drop rays beyond this multiple of the median residual; 0 = off"
     )
+    filter_by: Literal["depth", "loss"] = Field(
+        "depth",
+        description="the residual that dynamic_filter goes by: depth alone (released code), or the whole loss of "
+        "Eq. 12, colour included (paper)",
+    )
     median_includes_missing: bool = Field(
         False, description="rays without depth count in the median, as in the released code"
     )
@@ -109,6 +119,12 @@ class TrackingConfig(_Group):
         True,
         description="only rays count that end where a mapped frame has measured something, for elsewhere the map is a "
         "guess; off = all rays (paper)",
+    )
+    coarse_term: bool = Field(
+        False,
+        description="rays that end where no mapped frame has measured anything get the coarse term of Eq. 11 (paper): "
+        "the depth that the coarse level forecasts; needs optimizer adam, mapping.loss rendering and mapping.coarse, "
+        "with 500 first iterations or more, for before these the coarse level is opaque",
     )
     constant_speed: bool = Field(True, description="start from the last motion instead of the last pose")
     keep_best: Literal["last", "fixed_pixels"] = Field(

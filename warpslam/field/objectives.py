@@ -20,10 +20,17 @@ def mapping_loss(batch: RayBatch, color_weight: float, depth_weight: float = 1.0
     _sum_over_rays(batch, losses.mapping_loss, inputs)
 
 
-def tracking_loss(batch: RayBatch, color_weight: float) -> None:
-    """Eq. 11-12 over the inliers."""
+def tracking_loss(batch: RayBatch, color_weight: float, forecast: RayBatch | None = None) -> None:
+    """Eq. 11-12 over the inliers.
+
+    forecast: Rays rendered from the coarse level, whose inliers add the coarse term of Eq. 11; they share the launcher.
+    """
     inputs = [batch.inlier, batch.measured_depth, batch.measured_rgb, batch.sigma, 1.0, color_weight]
     _sum_over_rays(batch, losses.tracking_loss, inputs)
+    if forecast is not None:
+        inputs = [forecast.inlier, forecast.measured_depth, forecast.measured_rgb, forecast.sigma, 1.0, 0.0]
+        inputs += [forecast.depth, forecast.rgb]
+        batch.launcher.launch_taped(losses.tracking_loss, forecast.count, inputs, [batch.loss])
 
 
 def _sum_over_rays(batch: RayBatch, kernel: wp.Kernel, inputs: list) -> None:
@@ -33,16 +40,25 @@ def _sum_over_rays(batch: RayBatch, kernel: wp.Kernel, inputs: list) -> None:
 
 
 def choose_inliers(
-    batch: RayBatch, filter_factor: float, *, median_includes_missing: bool = False, normalized: bool = True
+    batch: RayBatch,
+    filter_factor: float,
+    *,
+    median_includes_missing: bool = False,
+    normalized: bool = True,
+    color_weight: float = 0.0,
 ) -> None:
     """Depth residuals, normalised by the rendered standard deviation or not, their median and the inliers, whose
     residual is below ``filter_factor`` times that (Sec. 3.3, dynamic objects).
+
+    color_weight: Of the colour residuals that are added to them: lambda_pt makes them the loss of Eq. 12.
     """
     launch = batch.launcher.launch
     batch.launcher.call(batch.counts.zero_)
     inputs = [batch.keep, batch.measured_depth, batch.depth, batch.variance]
     inputs += [int(median_includes_missing), int(normalized), batch.sigma, batch.residual, batch.counts]
     launch(losses.tracking_residuals, batch.count, inputs)
+    if color_weight > 0.0:
+        launch(losses.add_color_residuals, batch.count, [batch.measured_rgb, batch.rgb, color_weight, batch.residual])
     if filter_factor > 0.0:
         launch(losses.lower_median, batch.count, [batch.residual[: batch.count], batch.counts, batch.median])
     inputs = [batch.keep, batch.measured_depth, batch.residual, batch.median, filter_factor]
@@ -103,13 +119,16 @@ def gauss_newton_step(
     batch.launcher.launch(gauss_newton.gauss_newton_step_of_entries, 1, [motion.entries, poses])
 
 
-def note_rays(batch: RayBatch, noted: wp.array) -> None:
+def note_rays(batch: RayBatch, noted: wp.array, forecast: RayBatch | None = None) -> None:
     """After a loss: keep whether a ray is kept, whether it is an inlier, its measured and its rendered depth [m].
 
-    noted: Float (iterations, rays + 1, 4); the last row of an iteration holds the loss.
+    noted: Float (iterations, rays + 1, 4); the last row of an iteration holds the loss, and beside it how many inliers
+        ``forecast`` has, the rays of the coarse term.
     """
     inputs = [batch.iteration, batch.keep, batch.inlier, batch.measured_depth, batch.depth, batch.loss, noted]
     batch.launcher.launch(losses.note_rays, batch.count, inputs)
+    if forecast is not None:
+        batch.launcher.launch(losses.note_forecast, 1, [batch.iteration, forecast.counts, noted])
 
 
 class MotionArrays:

@@ -99,7 +99,7 @@ def geometry_adjoint(
     inputs = [listed, batch.rays, arrays.level(level), _weights(batch, arrays, level)]
     scatter = _scatter(batch, arrays, level, gradients, listed, stop - first)
     if level == "coarse":
-        inputs += [batch.logit_grad, _grid_gradient(batch, gradients, level)]
+        inputs += [batch.logit_grad, _grid_gradient(batch, gradients, level), int(gradients.points), batch.point_grad]
         return [(_kernels(batch, arrays).coarse_backward, dim, inputs), *scatter]
     inputs += [OUT_64 if level == "fine" else OUT_32, batch.logit_grad, _grid_gradient(batch, gradients, level)]
     inputs += [int(gradients.points), batch.point_grad]

@@ -223,6 +223,14 @@ class RayBatch:
         inputs = [arrays.lattices["color"], arrays.seen, self.rays, self.measured_depth, self.keep]
         self.launcher.launch(rejection.drop_unseen, self.count, inputs)
 
+    def keep_unseen(self, arrays: FieldArrays) -> None:
+        """After `bound`: keep the rays alone that end where no mapped frame has measured anything (`drop_unseen`)."""
+        if arrays.seen is None:
+            self.launcher.call(self.keep.zero_)
+            return
+        inputs = [arrays.lattices["color"], arrays.seen, self.rays, self.measured_depth, self.keep]
+        self.launcher.launch(rejection.keep_unseen, self.count, inputs)
+
     def drop_contradicted(
         self,
         images: tuple[wp.array, wp.array, wp.array],

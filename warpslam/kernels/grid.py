@@ -11,7 +11,7 @@ Adjoint for an incoming gradient dc: ``grad[place[row]] += w_corner * dc`` for r
 Rows are laid out in one of two ways. Dense: one for each vertex of the box, in the order of i, j, k. In blocks: the box
 is cut into blocks of 4 x 4 x 4 vertices at whole multiples of 4 of the world lattice, and only blocks that were made
 have rows, in the order in which they were made; their features begin as those of a dense grid. All others share the
-first 64, which are random, too, and never written.
+first 64, which begin alike and are never written.
 """
 
 import warp as wp
@@ -57,6 +57,16 @@ class Level:
 
     lattice: Lattice
     features: wp.array[Vec32]
+
+
+@wp.struct
+class Start:
+    """Features that vertices of a level begin with: ``mean`` plus normal ones of deviation ``std``."""
+
+    seed: int
+    level: int
+    std: float
+    mean: Vec32
 
 
 @wp.struct
@@ -215,30 +225,28 @@ def interpolate_adjoint_features(
 
 
 @wp.func
-def init_normal(seed: int, level: int, i: int, j: int, k: int, std: float) -> Vec32:
-    """Random features of a vertex from its world lattice index: the same whenever and in whatever order it is made."""
-    state = wp.rand_init(seed + 7919 * level, ((i * 73856093) ^ (j * 19349663)) ^ (k * 83492791))
+def init_normal(start: Start, i: int, j: int, k: int) -> Vec32:
+    """First features of a vertex from its world lattice index: the same whenever and in whatever order it is made."""
+    state = wp.rand_init(start.seed + 7919 * start.level, ((i * 73856093) ^ (j * 19349663)) ^ (k * 83492791))
     c = Vec32()
     for n in range(32):
-        c[n] = std * wp.randn(state)
-    return c
+        c[n] = start.std * wp.randn(state)
+    return c + start.mean
 
 
 @wp.kernel(enable_backward=False)
 def fill_grid(
     lattice: Lattice,
     first: wp.vec3i,
-    seed: int,
-    level: int,
-    std: float,
+    start: Start,
     old: Level,
     old_seen: wp.array[wp.uint8],
     shift: wp.vec3i,
     features: wp.array[Vec32],
     seen: wp.array[wp.uint8],
 ):
-    """Fill a dense grid of any extent: rows of the old grid are kept, the others start random (``first``: world index
-    of vertex 0).
+    """Fill a dense grid of any extent: rows of the old grid are kept, the others begin anew (``first``: world index of
+    vertex 0).
     """
     i, j, k = wp.tid()
     row = row_of(lattice, i, j, k)
@@ -251,31 +259,29 @@ def fill_grid(
         features[row] = old.features[old_row]
         seen[row] = old_seen[old_row]
     else:
-        features[row] = init_normal(seed, level, first[0] + i, first[1] + j, first[2] + k, std)
+        features[row] = init_normal(start, first[0] + i, first[1] + j, first[2] + k)
         seen[row] = wp.uint8(0)
 
 
 @wp.kernel(enable_backward=False)
-def fill_shared(seed: int, level: int, std: float, features: wp.array[Vec32]):
+def fill_shared(start: Start, features: wp.array[Vec32]):
     """The rows that the vertices of all blocks share that were not made."""
     row = wp.tid()
-    features[row] = init_normal(seed, level, row >> 4, (row >> 2) & 3, row & 3, std)
+    features[row] = init_normal(start, row >> 4, (row >> 2) & 3, row & 3)
 
 
 @wp.kernel(enable_backward=False)
 def fill_rows(
     rows: wp.array[int],
     lattice: Lattice,
-    seed: int,
-    level: int,
-    std: float,
+    start: Start,
     features: wp.array[Vec32],
     seen: wp.array[wp.uint8],
 ):
-    """Rows of blocks that are listed start random, as those of a dense grid."""
+    """Rows of blocks that are listed begin anew, as those of a dense grid."""
     row = rows[wp.tid()]
     v = vertex_of(lattice, row) + lattice.first
-    features[row] = init_normal(seed, level, v[0], v[1], v[2], std)
+    features[row] = init_normal(start, v[0], v[1], v[2])
     seen[row] = wp.uint8(0)
 
 

@@ -2,7 +2,8 @@
 
     mapping:   L = sum_{kept, D > 0} |D - D^|  +  lambda_p sum_kept |I - I^|_1      Eq. 8, 9, 10
     tracking:  r = |D - D^| / sqrt(V + 1e-10), V detached                           Eq. 11
-               inlier: D > 0 and (r < 10 median(r) where the dynamic filter is on)
+               inlier: D > 0 and (s < 10 median(s) where the dynamic filter is on),
+                       s = r, or (Sec. 3.3) s = r + lambda_pt |I - I^|_1
                L = sum_inlier r  +  lambda_pt sum_inlier |I - I^|_1                 Eq. 12
 
 |.|_1 sums the three channels. The loss kernels are differentiated by the tape; residuals and the choice of inliers
@@ -65,6 +66,19 @@ def tracking_residuals(
             r /= s
         wp.atomic_add(candidate_count, 0, 1)
     residual[tid] = r
+
+
+@wp.kernel(enable_backward=False)
+def add_color_residuals(
+    measured_rgb: wp.array[wp.vec3],
+    rgb: wp.array[wp.vec3],
+    color_weight: float,
+    residual: wp.array[float],
+):
+    """After `tracking_residuals`: a ray's whole loss of Eq. 12, by which the dynamic filter goes in Sec. 3.3."""
+    tid = wp.tid()
+    if residual[tid] >= 0.0:
+        residual[tid] = residual[tid] + color_weight * l1(measured_rgb[tid], rgb[tid])
 
 
 @wp.func
@@ -159,3 +173,9 @@ def note_rays(
     noted[n, tid, 3] = depth[tid]
     if tid == 0:
         noted[n, noted.shape[1] - 1, 0] = loss[0]
+
+
+@wp.kernel(enable_backward=False)
+def note_forecast(iteration: wp.array[int], counts: wp.array[int], noted: wp.array3d[float]):
+    """Beside the loss that `note_rays` keeps: how many rays of the coarse term are in it."""
+    noted[iteration[0], noted.shape[1] - 1, 1] = float(counts[1])

@@ -29,18 +29,36 @@ def least_and_largest_depth(images: Images, slot: int, pixel: wp.vec2i) -> wp.ve
     return wp.vec2(least, largest)
 
 
+@wp.func
+def is_seen(lattice: Lattice, seen: wp.array[wp.uint8], p: wp.vec3) -> bool:
+    """Whether a mapped frame has seen all vertices of the cell in which a point lies."""
+    corner = find_cell(lattice, p).corner
+    result = bool(True)
+    for di in range(2):
+        for dj in range(2):
+            for dk in range(2):
+                if seen[row_of(lattice, corner[0] + di, corner[1] + dj, corner[2] + dk)] == wp.uint8(0):
+                    result = False
+    return result
+
+
 @wp.kernel(module=MODULE, enable_backward=False)
 def drop_unseen(lattice: Lattice, seen: wp.array[wp.uint8], rays: Rays, depth: wp.array[float], keep: wp.array[int]):
     """Leave out rays that end in a cell with a vertex that no mapped frame has seen."""
     tid = wp.tid()
     if keep[tid] == 0 or depth[tid] <= 0.0:
         return
-    corner = find_cell(lattice, rays.origin[tid] + depth[tid] * rays.direction[tid]).corner
-    for di in range(2):
-        for dj in range(2):
-            for dk in range(2):
-                if seen[row_of(lattice, corner[0] + di, corner[1] + dj, corner[2] + dk)] == wp.uint8(0):
-                    keep[tid] = 0
+    if not is_seen(lattice, seen, rays.origin[tid] + depth[tid] * rays.direction[tid]):
+        keep[tid] = 0
+
+
+@wp.kernel(module=MODULE, enable_backward=False)
+def keep_unseen(lattice: Lattice, seen: wp.array[wp.uint8], rays: Rays, depth: wp.array[float], keep: wp.array[int]):
+    """Keep those rays alone that `drop_unseen` leaves out."""
+    tid = wp.tid()
+    if keep[tid] != 0:
+        if depth[tid] <= 0.0 or is_seen(lattice, seen, rays.origin[tid] + depth[tid] * rays.direction[tid]):
+            keep[tid] = 0
 
 
 @wp.kernel(module=MODULE, enable_backward=False)

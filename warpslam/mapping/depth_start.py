@@ -19,7 +19,8 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.field.arrays import projection, struct
-from warpslam.field.decoders import BLOCK_COUNT, EMBEDDING_SIZE, FEATURE_SIZE, SKIP_BLOCK, DecoderWeights
+from warpslam.field.decoders import FEATURE_SIZE, DecoderWeights
+from warpslam.field.feature_fit import EXTENT, POINTS, double_tensors, least_squares, logit_and_derivative
 from warpslam.kernels import seen
 from warpslam.kernels.grid import Vec32
 from warpslam.mapping.frustum import REACH
@@ -29,12 +30,6 @@ from warpslam.scene.feature_grid import FeatureGrid
 # Of the logit by the distance, and the largest distance, in vertex spacings.
 STEEPNESS = 2.56
 TRUNCATION = 1.6
-_POINTS = 1500
-_EXTENT = 6.0  # [m] points of the fit lie so far from the origin, along each axis
-_ITERATIONS = 50
-# Weight of the squared features against that of the squared error of the logit: small ones stay within the optimiser's
-# reach.
-_RIDGE = 1e-3
 
 
 class DepthStart:
@@ -90,10 +85,10 @@ def fit_signed_distance(weights: DecoderWeights, steepness: float, truncation: f
     Returns:
         base, slope [1/m]: float32 (32,) each.
     """
-    tensors = {name: tensor.astype(np.float64) for name, tensor in weights.padded().tensors.items()}
+    tensors = double_tensors(weights)
     rng = np.random.default_rng(0)
-    points = rng.uniform(-_EXTENT, _EXTENT, (_POINTS, 3))
-    s = rng.uniform(-truncation, truncation, (_POINTS, 1))
+    points = rng.uniform(-EXTENT, EXTENT, (POINTS, 3))
+    s = rng.uniform(-truncation, truncation, (POINTS, 1))
     target = steepness * s[:, 0]
 
     def errors(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -102,45 +97,5 @@ def fit_signed_distance(weights: DecoderWeights, steepness: float, truncation: f
         logits, by_feature = logit_and_derivative(tensors, points, features)
         return logits - target, np.concatenate([by_feature, s / truncation * by_feature], axis=1)
 
-    x = np.zeros(2 * FEATURE_SIZE)
-    damping = 1.0
-    error, J = errors(x)
-    cost = np.mean(error**2) + _RIDGE * x @ x
-    for _ in range(_ITERATIONS):
-        H = J.T @ J / _POINTS
-        H += np.diag(damping * np.diag(H) + _RIDGE)
-        candidate = x - np.linalg.solve(H, J.T @ error / _POINTS + _RIDGE * x)
-        new_error, new_J = errors(candidate)
-        new_cost = np.mean(new_error**2) + _RIDGE * candidate @ candidate
-        if new_cost < cost:
-            x, error, J, cost = candidate, new_error, new_J, new_cost
-            damping = max(damping / 3.0, 1e-4)
-        else:
-            damping *= 3.0
+    x = least_squares(errors, np.zeros(2 * FEATURE_SIZE))
     return x[:FEATURE_SIZE].astype(np.float32), (x[FEATURE_SIZE:] / truncation).astype(np.float32)
-
-
-def logit_and_derivative(
-    tensors: dict[str, np.ndarray], points: np.ndarray, features: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Logits (N,) of a decoder at points (N, 3) [m] with features (N, 32), and their derivatives by those, (N, 32).
-
-    tensors: By the reference's names, see `warpslam.field.decoders`.
-    """
-    embedding = np.sin(points @ tensors["embedder._B"])
-    h = embedding
-    active = []
-    for k in range(BLOCK_COUNT):
-        entry = np.concatenate([embedding, h], axis=1) if k == SKIP_BLOCK else h
-        a = entry @ tensors[f"pts_linears.{k}.weight"].T + tensors[f"pts_linears.{k}.bias"]
-        active.append(a > 0)
-        h = np.maximum(a, 0.0) + features @ tensors[f"fc_c.{k}.weight"].T + tensors[f"fc_c.{k}.bias"]
-    output = tensors["output_linear.weight"][0]
-    g = np.broadcast_to(output, h.shape)
-    by_feature = np.zeros_like(features)
-    for k in reversed(range(BLOCK_COUNT)):
-        by_feature += g @ tensors[f"fc_c.{k}.weight"]
-        if k > 0:
-            weight = tensors[f"pts_linears.{k}.weight"]
-            g = (g * active[k]) @ (weight[:, EMBEDDING_SIZE:] if k == SKIP_BLOCK else weight)
-    return h @ output + tensors["output_linear.bias"][0], by_feature

@@ -369,7 +369,7 @@ class Mapper:
             self._poses.update(first=1)
         batch.next_iteration()
 
-    # -- the coarse level (Sec. 3.1; in the released code it serves forecasts only) -------------------------------
+    # -- the coarse level (Sec. 3.1), for forecasts and, if wanted, the coarse term of tracking -------------------
 
     def _run_coarse(
         self,

@@ -7,7 +7,6 @@ import warp as wp
 
 from warpslam.camera import Intrinsics
 from warpslam.field.arrays import camera_struct, lazy_zeros, struct
-from warpslam.field.decoders import LEVELS
 from warpslam.field.ray_batch import image_struct
 from warpslam.kernels import grid as grid_kernels
 from warpslam.kernels.blocks import TILE, Reach, want_blocks
@@ -30,18 +29,25 @@ class BlockGrid(FeatureGrid):
     blocks: Which were made, in their order, int64 (n, 3), in units of blocks of the world lattice.
     """
 
-    def __init__(self, level: str, spacing: float, std: float, seed: int, device: wp.Device) -> None:
+    def __init__(
+        self,
+        level: str,
+        spacing: float,
+        std: float,
+        seed: int,
+        device: wp.Device,
+        mean: np.ndarray | None = None,
+    ) -> None:
         self.blocks = np.zeros((0, 3), np.int64)
         self._table = np.zeros((0, 0, 0), np.int32)
         self._device_table = wp.zeros(1, dtype=int, device=device)
         self._wanted = wp.zeros(1, dtype=int, device=device)
         self._count = wp.zeros(1, dtype=int, device=device)
         self._corners = wp.zeros(1, dtype=wp.vec3i, device=device)
-        super().__init__(level, spacing, std, seed, device)
+        super().__init__(level, spacing, std, seed, device, mean)
         self._launcher = Launcher(device)
         self._reserve(BLOCK_ROWS)
-        inputs = [seed, LEVELS.index(level), std, self.features]
-        self._launcher.launch(grid_kernels.fill_shared, BLOCK_ROWS, inputs)
+        self._launcher.launch(grid_kernels.fill_shared, BLOCK_ROWS, [self._start(), self.features])
 
     @property
     def row_count(self) -> int:
@@ -133,7 +139,7 @@ class BlockGrid(FeatureGrid):
     def renew(self, rows: np.ndarray) -> None:
         """See `FeatureGrid.renew`."""
         which = wp.array(rows.astype(np.int32), dtype=int, device=self.device)
-        inputs = [which, self.lattice, self.seed, LEVELS.index(self.level), self.std, self.features, self.seen]
+        inputs = [which, self.lattice, self._start(), self.features, self.seen]
         self._launcher.launch(grid_kernels.fill_rows, len(rows), inputs)
 
     def _note(self, blocks: np.ndarray, start: int) -> None:

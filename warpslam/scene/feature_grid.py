@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warpslam.field.decoders import LEVELS
+from warpslam.field.arrays import struct
+from warpslam.field.decoders import FEATURE_SIZE, LEVELS
 from warpslam.kernels import grid as grid_kernels
-from warpslam.kernels.grid import Lattice, Level, Vec32
+from warpslam.kernels.grid import Lattice, Level, Start, Vec32
 
 
 @dataclass(frozen=True)
@@ -35,13 +36,23 @@ class FeatureGrid:
 
     first: World lattice index of vertex 0, int64 (3,).
     shape: Vertices per axis.
+    std, mean: Of the features that new vertices begin with; the mean is float32 (32,), zero by default.
     features: Array of `Vec32`, one row a vertex (`warpslam.kernels.grid.row_of`), and room for more.
     seen: 1 where a mapped frame has measured what is at a vertex, uint8 (rows,): of the colour level, which tracking
         goes by (`RayBatch.drop_unseen`), and of the middle one, where `warpslam.mapping.depth_start` started it.
     """
 
-    def __init__(self, level: str, spacing: float, std: float, seed: int, device: wp.Device) -> None:
+    def __init__(
+        self,
+        level: str,
+        spacing: float,
+        std: float,
+        seed: int,
+        device: wp.Device,
+        mean: np.ndarray | None = None,
+    ) -> None:
         self.level, self.spacing, self.std, self.seed, self.device = level, spacing, std, seed, device
+        self.mean = np.zeros(FEATURE_SIZE, np.float32) if mean is None else mean
         self.first = np.zeros(3, np.int64)
         self.shape: tuple[int, int, int] = (0, 0, 0)
         self.features = wp.zeros(1, dtype=Vec32, device=device)
@@ -102,8 +113,7 @@ class FeatureGrid:
         wp.launch(
             grid_kernels.fill_grid,
             dim=shape,
-            inputs=[self.lattice, wp.vec3i(*first), self.seed, LEVELS.index(self.level), self.std]
-            + [old, old_seen, wp.vec3i(*shift)],
+            inputs=[self.lattice, wp.vec3i(*first), self._start(), old, old_seen, wp.vec3i(*shift)],
             outputs=[self.features, self.seen],
             device=self.device,
             record_tape=False,
@@ -111,7 +121,7 @@ class FeatureGrid:
 
     def renew(self, rows: np.ndarray) -> None:
         """Some rows, int (n,), become again what a new vertex is; `seen` says so, too."""
-        fresh = FeatureGrid(self.level, self.spacing, self.std, self.seed, self.device)
+        fresh = FeatureGrid(self.level, self.spacing, self.std, self.seed, self.device, self.mean)
         fresh._resize(self.first, self.shape)
         fresh.seen = self.seen
         seen = self.seen.numpy().copy()
@@ -140,6 +150,11 @@ class FeatureGrid:
             inputs = [rows, other.features, self.features]
             wp.launch(grid_kernels.copy_rows, rows.shape[0], inputs, device=self.device, record_tape=False)
             wp.copy(self.seen, other.seen)
+
+    def _start(self) -> Start:
+        """What new vertices begin with, as the kernels take it."""
+        parts = {"seed": self.seed, "level": LEVELS.index(self.level), "std": self.std}
+        return struct(Start, **parts, mean=Vec32(*self.mean))
 
     def _lattice(self) -> Lattice:
         lattice = Lattice()

@@ -14,6 +14,7 @@ from warpslam.config import GridConfig
 from warpslam.errors import InputError, MapSizeError
 from warpslam.field.arrays import FieldArrays
 from warpslam.field.decoders import LEVELS, Decoders
+from warpslam.field.feature_fit import free_feature
 from warpslam.field.packing import PackedDecoder
 from warpslam.field.passes import query
 from warpslam.field.ray_batch import RayBatch
@@ -54,7 +55,7 @@ class SceneMap:
 
     def __init__(self, decoders: Decoders, config: GridConfig, device: wp.Device, seed: int = 0) -> None:
         self.config, self.device, self.decoder_weights, self.seed = config, device, decoders, seed
-        self.grids = {level: new_grid(level, config, seed, device) for level in LEVELS}
+        self.grids = {level: new_grid(level, config, seed, device, decoders) for level in LEVELS}
         self.decoders = {weights.level: PackedDecoder(weights, device) for weights in decoders}
         self.low = np.zeros(3)
         self.high = np.zeros(3)
@@ -269,10 +270,16 @@ class SceneMap:
         return np.clip(result, 0.0, 1.0) if stage == "color" else result
 
 
-def new_grid(level: str, config: GridConfig, seed: int, device: wp.Device) -> FeatureGrid:
-    """An empty grid of a level. The coarse one is dense: it forecasts what was not seen, and has few vertices."""
+def new_grid(level: str, config: GridConfig, seed: int, device: wp.Device, decoders: Decoders) -> FeatureGrid:
+    """An empty grid of a level. The coarse one is dense: it forecasts what was not seen, and has few vertices.
+
+    Raises:
+        CheckpointError: With `GridConfig.middle_start` free, see `warpslam.field.feature_fit.free_feature`.
+    """
     spacing, std = getattr(config, f"{level}_spacing"), getattr(config, f"{level}_std")
     kind = BlockGrid if is_in_blocks(level, config) else FeatureGrid
+    if level == "middle" and config.middle_start == "free":
+        return kind(level, spacing, 0.0, seed, device, free_feature(decoders.middle))
     return kind(level, spacing, std, seed, device)
 
 

@@ -31,7 +31,7 @@ class TrackingResult:
     """Outcome of tracking one frame.
 
     T_world_camera: Estimated pose (4, 4).
-    loss: Mean loss per inlier on the fixed pixels.
+    loss: Mean loss per inlier on the fixed pixels, those of the coarse term included (`TrackingConfig.coarse_term`).
     depth_error: Mean |D - D^| over the inliers [m].
     inliers: Inliers over rays with a measured depth that count (`TrackingConfig.seen_only`), in [0, 1]; less if few do.
     agreeing: Inliers over all rays with a measured depth, in [0, 1].
@@ -53,6 +53,7 @@ class Tracker:
         self.camera, self.config, self.sampling, self.device, self.seed = camera, config, sampling, device, seed
         self._launcher = Launcher(device)
         self._batch = self._new_batch(config.pixels)
+        self._forecast: RayBatch | None = None
         self._poses = PoseOptimizer(1, self._launcher)
         self._window = wp.zeros(1, dtype=int, device=device)
         self._visited = wp.zeros((1, 7), dtype=float, device=device)
@@ -111,7 +112,7 @@ class Tracker:
         """The paper's optimiser: a step of Adam on the pose vector."""
         with self._launcher.tape() as tape:
             self._render(batch, arrays, images, tape)
-            tracking_loss(batch, self.config.color_weight)
+            tracking_loss(batch, self.config.color_weight, self._forecast_of(batch))
         self._launcher.call(partial(tape.backward, batch.loss))
         self._poses.update()
 
@@ -147,8 +148,9 @@ class Tracker:
         def judge() -> None:
             self._launcher.launch(adam.take_pose, 7, [batch.iteration, self._candidates, self._poses.poses])
             self._render(batch, arrays, images)
-            tracking_loss(batch, self.config.color_weight)
-            note_rays(batch, self._judged)
+            forecast = self._forecast_of(batch)
+            tracking_loss(batch, self.config.color_weight, forecast)
+            note_rays(batch, self._judged, forecast)
             batch.next_iteration()
 
         uses = (self.config.color_weight, self._judged, *self._uses(batch, arrays), *images.arrays)
@@ -158,24 +160,52 @@ class Tracker:
 
     def _render(self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, tape: wp.Tape | None = None) -> None:
         config, sampling = self.config, self.sampling
-        edges = (config.ignore_edge_u, config.ignore_edge_v)
-        batch.draw(images.arrays, self._window, batch.capacity, self.camera, edges=edges)
-        batch.cast(self._poses.poses, differentiate=tape is not None)
-        batch.bound(arrays)
+        self._draw(batch, arrays, images, tape)
         if config.seen_only:
             batch.drop_unseen(arrays)
         batch.place_samples(sampling.stratified, sampling.surface, jitter=sampling.jitter)
         gradients = None if tape is None else Gradients(points=True)
         render(batch, arrays, "color", gradients, tape, thresholds=self._thresholds)
-        choose_inliers(batch, config.dynamic_filter, median_includes_missing=config.median_includes_missing)
+        choose_inliers(
+            batch,
+            config.dynamic_filter,
+            median_includes_missing=config.median_includes_missing,
+            color_weight=config.color_weight if config.filter_by == "loss" else 0.0,
+        )
+        forecast = self._forecast_of(batch)
+        if forecast is not None:
+            # As the coarse level was trained (`warpslam.mapping.coarse`): what a ray renders to depends on how densely
+            # its samples lie, and depth must not place them about itself.
+            self._draw(forecast, arrays, images, tape)
+            forecast.keep_unseen(arrays)
+            forecast.place_samples(sampling.stratified, 0, use_depth=False, jitter=sampling.jitter)
+            render(forecast, arrays, "coarse", gradients, tape, thresholds=self._thresholds)
+            choose_inliers(forecast, config.dynamic_filter)
+
+    def _draw(self, batch: RayBatch, arrays: FieldArrays, images: ImagePool, tape: wp.Tape | None) -> None:
+        """Random pixels, and those of their rays that end in the map."""
+        edges = (self.config.ignore_edge_u, self.config.ignore_edge_v)
+        batch.draw(images.arrays, self._window, batch.capacity, self.camera, edges=edges)
+        batch.cast(self._poses.poses, differentiate=tape is not None)
+        batch.bound(arrays)
+
+    def _forecast_of(self, batch: RayBatch) -> RayBatch | None:
+        """The pixels of a batch once more, for the coarse term of Eq. 11 where nothing was seen; None without it."""
+        if not self.config.coarse_term:
+            return None
+        if self._forecast is None or self._forecast.capacity != batch.capacity:
+            self._forecast = RayBatch(batch.capacity, self.sampling.stratified, self.device, self._launcher)
+        self._forecast.seeds, self._forecast.iteration = batch.seeds, batch.iteration
+        return self._forecast
 
     def _uses(self, batch: RayBatch, arrays: FieldArrays) -> tuple:
         """What a recorded iteration stands on."""
-        features = (arrays.features[level] for level in ("middle", "fine", "color"))
-        lattices = (arrays.lattices[level] for level in ("middle", "fine", "color"))
-        weights = (arrays.decoders[level].weights for level in ("middle", "fine", "color"))
+        levels = ("middle", "fine", "color", *(("coarse",) if self.config.coarse_term else ()))
+        features = (arrays.features[level] for level in levels)
+        lattices = (arrays.lattices[level] for level in levels)
+        weights = (arrays.decoders[level].weights for level in levels)
         grids = (arrays.seen, *features, *lattices, *weights, *arrays.low, *arrays.high)
-        return (batch, batch.seeds, self._poses.poses, *grids)
+        return (batch, self._forecast_of(batch), batch.seeds, self._poses.poses, *grids)
 
     def _ray_seed(self, frame: int, iteration: int) -> int:
         return ray_seed(self.seed, 1, frame, iteration)
@@ -193,7 +223,8 @@ def _result(vector: np.ndarray, judged: np.ndarray) -> TrackingResult:
     counting = max(int((has_depth & (keep != 0)).sum()), MIN_SEEN_SHARE * depth_count)
     inlier_count = int((inlier != 0).sum())
     error = np.abs(measured - depth)[inlier != 0]
-    loss = float(judged[-1, 0]) / inlier_count if inlier_count else np.inf
+    term_count = inlier_count + int(judged[-1, 1])
+    loss = float(judged[-1, 0]) / term_count if inlier_count else np.inf
     return TrackingResult(
         T_world_camera=pose_from_vector(vector),
         loss=loss if np.isfinite(loss) else np.inf,

@@ -306,6 +306,26 @@ def sample_functions(build: Build) -> None:
                     put_row(gradient.by_sample, samples[p], 0, dc[p])
 
     @func
+    def add_lookups(
+        point_grad: wp.array[wp.vec3],
+        samples: Indices,
+        positions: Positions,
+        wanted: Indices,
+        level: Level,
+        dc: Block,
+    ):
+        """`add_to_points` of a decoder without embedding: through the lookup."""
+        for p in range(size):
+            if wanted[p] != 0:
+                x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
+                if wp.static(on_cpu):
+                    d = interpolate_adjoint_point(level, find_cell(level.lattice, x), dc[p])
+                    point_grad[samples[p]] = point_grad[samples[p]] + d
+                else:
+                    d = interpolate_adjoint_point_quads(level, find_cell(level.lattice, x), dc[p])
+                    point_grad[samples[p]] = point_grad[samples[p]] + d
+
+    @func
     def add_to_points(
         point_grad: wp.array[wp.vec3],
         samples: Indices,

@@ -26,7 +26,7 @@ def coarse_kernels(build: Build) -> dict[str, wp.Kernel]:
     any_lit, output_of, outer, fill = build.any_lit, build.output_of, build.outer, build.fill
     listed_samples, wanted_of, wanted_gradient = build.listed_samples, build.wanted_of, build.wanted_gradient
     matvec, relu, store_bits, keep_active = build.matvec, build.relu, build.store_bits, build.keep_active
-    add_to_grid = build.add_to_grid
+    add_to_grid, add_lookups = build.add_to_grid, build.add_lookups
 
     @build.kernel
     def coarse_forward(
@@ -58,9 +58,16 @@ def coarse_kernels(build: Build) -> dict[str, wp.Kernel]:
 
     @build.kernel
     def coarse_backward(
-        listed: Listed, rays: Rays, level: Level, decoder: Weights, logit_grad: wp.array[float], grid: RowGradient
+        listed: Listed,
+        rays: Rays,
+        level: Level,
+        decoder: Weights,
+        logit_grad: wp.array[float],
+        grid: RowGradient,
+        want_point: int,
+        point_grad: wp.array[wp.vec3],
     ):
-        """Adjoint of `coarse_forward`; the coarse level serves mapping only: the position gets no gradient."""
+        """Adjoint of `coarse_forward`; positions enter through the lookup alone."""
         thread = wp.tid()
         count = listed_count(listed)
         if size * thread >= count:
@@ -75,6 +82,10 @@ def coarse_kernels(build: Build) -> dict[str, wp.Kernel]:
         a = keep_active(matvec(Block(), a, decoder.T, C_W2), decoder.bits, samples, 1)
         a = keep_active(matvec(Block(), a, decoder.T, C_W1), decoder.bits, samples, 0)
         dc = matvec(dc, a, decoder.T, C_W0)
-        add_to_grid(grid, listed.slot, level, samples, positions_of(samples, rays), wanted, dc)
+        positions = positions_of(samples, rays)
+        if grid.wanted != 0:
+            add_to_grid(grid, listed.slot, level, samples, positions, wanted, dc)
+        if want_point != 0:
+            add_lookups(point_grad, samples, positions, wanted, level, dc)
 
     return {kernel.key: kernel for kernel in (coarse_forward, coarse_backward)}
