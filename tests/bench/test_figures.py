@@ -23,7 +23,8 @@ def test_units(tmp_path):
             "map": {"bytes": 2_500_000, "flops_per_point": None},
         },
     )
-    frames = [{"tracking": 9.0, "mapping": 9.0}, {"tracking": 0.1}, {"tracking": 0.3, "mapping": 0.7}]
+    seconds = [{"tracking": 9.0, "mapping": 9.0}, {"tracking": 0.1}, {"tracking": 0.3, "mapping": 0.7}]
+    frames = [{"index": index, **of_frame} for index, of_frame in enumerate(seconds)]
     write_json(folder.timing, {"frames": frames})
     assert read_figures(folder) == pytest.approx(
         {"ate": 1.2, "accuracy": 2.0, "ratio": 50.0, "memory": 2.5, "tracking": 200.0, "mapping": 700.0}
