@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from warpslam.camera import Intrinsics
-from warpslam.errors import ConfigError, MeshError
+from warpslam.errors import ConfigError, InputError, MeshError
 from warpslam.evaluation import PROTOCOLS, Culling, Views, sample_surface, visible_points
 from warpslam.evaluation.culling import _ball_in_frustum
 from warpslam.poses import pose_from_vector
@@ -53,6 +53,13 @@ def test_visibility_respects_occlusion():
     poses = [np.full((4, 4), np.nan), np.eye(4)]
     seen = visible_points(points, poses, CAMERA, [np.full((100, 100), 9.0), depth])
     np.testing.assert_array_equal(seen, [True, True, False, False])
+
+
+@pytest.mark.parametrize("shape", [(100, 99), (4, 4), (200, 200), (10000,)])
+def test_depth_of_another_size_is_refused(shape):
+    """Its pixels would be read from wherever the camera's lie; nothing else of it is looked at."""
+    with pytest.raises(InputError, match=r"depths\[1\] has shape"):
+        visible_points(np.eye(3), [np.eye(4)] * 2, CAMERA, [np.ones((100, 100)), np.ones(shape)])
 
 
 def test_negative_tolerance_means_in_front():

@@ -75,7 +75,7 @@ def test_samples_that_remain_are_those_outside_of_free_space(scene_map, device):
     assert 0.02 < free.mean() < 0.9
 
     more, points = random_batch(device, rng)
-    z = more.z.numpy().reshape(RAYS, SAMPLES)
+    z = more.z.numpy().reshape(RAYS, SAMPLES).copy()
     wanted = ~free[tuple(np.moveaxis(cells_of(points, scene_map), -1, 0))]
     wanted[:, -1] = True
     more.leave_out_free(arrays, looks)

@@ -9,6 +9,7 @@ from typing import Any
 _RENDERING: dict[str, Any] = {
     "loss": "rendering", "iterations": 60, "refinement_rounds": 5, "refinement_iterations": None,
 }  # fmt: skip
+_PAPER_SAMPLING: dict[str, Any] = {"jitter": False, "min_occupancy": 0.0}
 _PAPER: dict[str, Any] = {"optimizer": "adam", "final_rate_factor": 1.0, "seen_only": False}
 
 
@@ -19,7 +20,7 @@ def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, A
         **groups.pop("mapping", {}),
     }  # fmt: skip
     return {
-        "sampling": {"jitter": False, "min_occupancy": 0.0},
+        "sampling": _PAPER_SAMPLING,
         "tracking": {**_PAPER, **(tracking or {})},
         "mapping": mapping,
         "keyframes": {"every": 50},
@@ -66,7 +67,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         **_BY_RENDERING,
         "sensor_timing": False,
         "published_images": True,
-        "sampling": {"jitter": False, "min_occupancy": 0.0},
+        "sampling": _PAPER_SAMPLING,
         "keyframes": {"every": 50},
         "tracking": {"final_rate_factor": 1.0},
         "imap": {

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warpslam.camera import Intrinsics
-from warpslam.errors import ConfigError, MeshError
+from warpslam.errors import ConfigError, InputError, MeshError
 
 if TYPE_CHECKING:
     import trimesh
@@ -87,9 +87,9 @@ class Culling:
     def may_keep(self, centers: np.ndarray, radii: np.ndarray) -> np.ndarray:
         """Which balls (N, 3), (N,) [m] may hold a point that counts, bool (N,); never wrong about one that does."""
         kept = np.zeros(len(centers), dtype=bool)
-        for T_world_camera, depth in zip(self.frames.poses, self.frames.depths, strict=True):
+        for T_world_camera, deepest in zip(self.frames.poses, self._deepest, strict=True):
             rest = np.flatnonzero(~kept)
-            farthest = float(np.max(depth)) + OCCLUSION_TOLERANCE if self._occlusion else np.inf
+            farthest = float(deepest) + OCCLUSION_TOLERANCE if self._occlusion else np.inf
             kept[rest] = _ball_in_frustum(centers[rest], radii[rest], T_world_camera, self.frames.intrinsics, farthest)
         return kept
 
@@ -118,6 +118,9 @@ def visible_points(
             counts only where it is no more than ``tolerance`` behind the depth of its pixel; without it, wherever it
             projects into the image.
         tolerance: Accepted distance behind the depth [m]; negative: it must lie that far in front of it.
+
+    Raises:
+        InputError: A depth image has another size than those of the camera.
     """
     import warp as wp
 
@@ -130,6 +133,9 @@ def visible_points(
     known = np.flatnonzero(np.isfinite(poses).all(axis=(1, 2)))
     images = [np.float32(np.inf)] * len(poses) if depths is None else list(depths)
     images = [np.require(images[n], np.float32, "C") for n in known]
+    for n, image in zip(known, images, strict=True):
+        if image.ndim and image.shape != (intrinsics.height, intrinsics.width):
+            raise InputError(f"depths[{n}] has shape {image.shape}, expected {(intrinsics.height, intrinsics.width)}")
     points, seen = np.ascontiguousarray(points, np.float64).reshape(-1, 3), np.zeros(len(points), np.uint8)
 
     def given(values: np.ndarray | list, dtype: type) -> wp.array:

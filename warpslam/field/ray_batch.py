@@ -276,20 +276,17 @@ class RayBatch:
 
     def leave_out_free(self, arrays: FieldArrays, looks: Looks) -> None:
         """Samples alone that are not in free space, so many a ray as the ray with most of them has."""
-        inputs = [arrays.lattices["fine"], self.rays, self.keep, looks]
+        counts = self.inlier  # nobody's before the loss
+        inputs = [arrays.lattices["fine"], self.rays, self.keep, looks, counts]
 
-        def count(first: int, stop: int, slot: int) -> list[Step]:
-            return [(free_space.count_wanted, stop - first, [first, *inputs, self.inlier])]
+        def steps(first: int, stop: int, slot: int) -> list[Step]:
+            return [(free_space.take_wanted, stop - first, [first, *inputs])]
 
-        self.launcher.slices(self.count, count)
-        width = int(self.inlier.numpy()[: self.count].max())
-        z = wp.empty_like(self.z)
-
-        def take(first: int, stop: int, slot: int) -> list[Step]:
-            return [(free_space.take_wanted, stop - first, [first, *inputs, width, z])]
-
-        self.launcher.slices(self.count, take)
-        self.z, self.sample_count = z, width
+        self.launcher.slices(self.count, steps)
+        width = int(counts.numpy()[: self.count].max())
+        z = self.z[: self.count * self.sample_count].reshape((self.count, self.sample_count))
+        wp.copy(self.z, z[:, :width].contiguous().flatten())
+        self.sample_count = width
 
 
 def image_struct(images: tuple[wp.array, wp.array, wp.array]) -> Images:

@@ -55,32 +55,21 @@ def is_wanted(sample: int, lattice: Lattice, rays: Rays, looks: Looks) -> bool:
 
 
 @wp.kernel(module=MODULE, enable_backward=False)
-def count_wanted(
-    first: int, lattice: Lattice, rays: Rays, keep: wp.array[int], looks: Looks, counts: wp.array[int]
-):  # fmt: skip
-    """Samples of each ray that are not in free space; 1 where a ray is not kept."""
-    ray = first + wp.tid()
-    count = int(0)
-    if keep[ray] != 0:
-        for n in range(rays.sample_count):
-            if is_wanted(ray * rays.sample_count + n, lattice, rays, looks):
-                count += 1
-    counts[ray] = wp.max(count, 1)
+def take_wanted(first: int, lattice: Lattice, rays: Rays, keep: wp.array[int], looks: Looks, counts: wp.array[int]):
+    """Bring the samples of each ray that are not in free space to its front; the last one again in place of the others.
 
-
-@wp.kernel(module=MODULE, enable_backward=False)
-def take_wanted(
-    first: int, lattice: Lattice, rays: Rays, keep: wp.array[int], looks: Looks, width: int, z: wp.array[float]
-):
-    """These samples, ``width`` a ray; the last one again where there are fewer."""
+    counts: Gets how many they are; 1 where a ray is not kept.
+    """
     ray = first + wp.tid()
+    counts[ray] = 1
     if keep[ray] == 0:
         return
+    start = ray * rays.sample_count
     count = int(0)
     for n in range(rays.sample_count):
-        sample = ray * rays.sample_count + n
-        if is_wanted(sample, lattice, rays, looks):
-            z[ray * width + count] = rays.z[sample]
+        if is_wanted(start + n, lattice, rays, looks):
+            rays.z[start + count] = rays.z[start + n]
             count += 1
-    for n in range(count, width):
-        z[ray * width + n] = rays.z[(ray + 1) * rays.sample_count - 1]
+    counts[ray] = count
+    for n in range(count, rays.sample_count):
+        rays.z[start + n] = rays.z[start + count - 1]

@@ -217,8 +217,9 @@ def sample_functions(build: Build) -> None:
     Level, find_cell, interpolate = build.grid.Level, build.grid.find_cell, build.grid.interpolate
     interpolate_adjoint_point = build.grid.interpolate_adjoint_point
     interpolate_adjoint_features = build.grid.interpolate_adjoint_features
-    interpolate_quads = build.interpolate_quads
-    interpolate_adjoint_point_quads = build.interpolate_adjoint_point_quads
+    # The same in the other's words, see `quad_functions`.
+    if not on_cpu:
+        interpolate, interpolate_adjoint_point = build.interpolate_quads, build.interpolate_adjoint_point_quads
 
     @func
     def block_samples(thread: int, span: Span, sample_count: int) -> Indices:
@@ -279,10 +280,7 @@ def sample_functions(build: Build) -> None:
         c = Block()
         for p in range(size):
             x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
-            if wp.static(on_cpu):
-                c[p] += interpolate(level, find_cell(level.lattice, x))
-            else:
-                c[p] += interpolate_quads(level, find_cell(level.lattice, x))
+            c[p] += interpolate(level, find_cell(level.lattice, x))
         return c
 
     @func
@@ -318,12 +316,8 @@ def sample_functions(build: Build) -> None:
         for p in range(size):
             if wanted[p] != 0:
                 x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
-                if wp.static(on_cpu):
-                    d = interpolate_adjoint_point(level, find_cell(level.lattice, x), dc[p])
-                    point_grad[samples[p]] = point_grad[samples[p]] + d
-                else:
-                    d = interpolate_adjoint_point_quads(level, find_cell(level.lattice, x), dc[p])
-                    point_grad[samples[p]] = point_grad[samples[p]] + d
+                d = interpolate_adjoint_point(level, find_cell(level.lattice, x), dc[p])
+                point_grad[samples[p]] = point_grad[samples[p]] + d
 
     @func
     def add_to_points(
@@ -341,10 +335,7 @@ def sample_functions(build: Build) -> None:
         d = Positions()
         for p in range(size):
             x = wp.vec3(positions[p, 0], positions[p, 1], positions[p, 2])
-            if wp.static(on_cpu):
-                d[p] = interpolate_adjoint_point(level, find_cell(level.lattice, x), dc[p])
-            else:
-                d[p] = interpolate_adjoint_point_quads(level, find_cell(level.lattice, x), dc[p])
+            d[p] = interpolate_adjoint_point(level, find_cell(level.lattice, x), dc[p])
         # Sums over the channels are slow on the CPU: there the chunks are added first. On CUDA registers are scarce.
         along_x = Block()
         along_y = Block()

@@ -36,16 +36,20 @@ _MATVEC = """
     return s;
 """
 
-# Tiles of the result whose sums stay in registers while k runs, eight vectors each: all columns at once where vectors
-# have 64 bytes, half of them where they have 32. Each number is the same sum in the same order. Called and not inlined,
-# so that the code of a decoder stays in the cache of instructions.
-_MATVEC_CPU = """
+# As wide as a register of the CPU.
+_VECTOR = """
 #ifdef __AVX512F__
     constexpr int lanes = 16;
 #else
     constexpr int lanes = 8;
 #endif
     typedef float vector __attribute__((vector_size(4 * lanes), aligned(4)));
+"""
+
+# Tiles of the result whose sums stay in registers while k runs, eight vectors each: all columns at once where vectors
+# have 64 bytes, half of them where they have 32. Each number is the same sum in the same order. Called and not inlined,
+# so that the code of a decoder stays in the cache of instructions.
+_MATVEC_CPU = """
     constexpr int size = sizeof(r.data) / sizeof(r.data[0]), samples = 4, columns = 2 * lanes;
     static_assert(size % samples == 0, "blocks are whole tiles");
     auto s = r;
@@ -81,12 +85,6 @@ _MATVEC_CPU = """
 
 # The same tiles, of four rows of the result.
 _ADD_OUTER = """
-#ifdef __AVX512F__
-    constexpr int lanes = 16;
-#else
-    constexpr int lanes = 8;
-#endif
-    typedef float vector __attribute__((vector_size(4 * lanes), aligned(4)));
     const int stride = 32 * columns.shape[1];
     const float* left = (const float*)columns.data + first * stride + 32 * x;
     const float* right = (const float*)columns.data + first * stride + 32 * d;
@@ -162,7 +160,7 @@ _PUT_ROW = """
 
 def native_matvec(Block: type, *, on_cpu: bool) -> Any:
     """r + x W[row:], for blocks of four samples and multiples (CPU) and for one (CUDA)."""
-    code = _MATVEC_CPU if on_cpu else _MATVEC
+    code = _VECTOR + _MATVEC_CPU if on_cpu else _MATVEC
 
     # Warp takes the type of the result from a decorator that is spelt like this.
     @wp.func_native(code)
@@ -171,7 +169,7 @@ def native_matvec(Block: type, *, on_cpu: bool) -> Any:
     return matvec
 
 
-@wp.func_native(_ADD_OUTER)
+@wp.func_native(_VECTOR + _ADD_OUTER)
 def add_outer(
     rows: wp.array2d[Vec32], slot: int, row: int, columns: wp.array2d[Vec32], first: int, count: int, x: int, d: int
 ):
