@@ -9,8 +9,10 @@ from pathlib import Path
 
 from warpslam.batch import worker as batch_worker
 from warpslam.batch.status import FINISHED
+from warpslam.batch.worker import HARD_FACTOR
 from warpslam.errors import DatasetError
 from warpslam.runs.folder import RunFolder
+from warpslam.runtime.environment import resident_bytes
 from warpslam.storage.json_files import write_json
 
 
@@ -32,8 +34,9 @@ def fake_run(job, folder: Path, report, watch, slot: int, **how: object) -> tupl
             if "killed" in job.name:
                 os.kill(os.getpid(), signal.SIGKILL)
             if "hungry" in job.name:
-                eaten.append(bytes(150_000_000))
-                eaten[-1] = bytearray(eaten[-1])  # touched, so that it counts
+                factor = 3 if "very" in job.name else 0.5 + HARD_FACTOR / 2
+                eaten.append(bytearray(int(factor * 1e9 * watch.budget_gb) - resident_bytes()))
+                eaten[-1][::1024] = b"\1" * len(range(0, len(eaten[-1]), 1024))  # touched, so that it counts
                 time.sleep(0.8)
             if "exits" in job.name:
                 print("last words", file=os.sys.stderr, flush=True)
