@@ -13,21 +13,40 @@ from warpslam.kernels.decoder.layout import (
     E0,
     E3,
     FC_BIAS,
-    W1,
-    W2,
-    W3,
-    W4,
-    B,
     V_T,
+    W1,
     W1_T,
+    W2,
     W2_T,
+    W3,
     W3_T,
+    W4,
     W4_T,
+    B,
     V,
     WeightGradient,
     Weights,
 )
 from warpslam.kernels.decoder.native import ADD_PRODUCT, VECTOR
+
+_SIZE = """
+    constexpr int size = sizeof(samples.c) / sizeof(samples.c[0]);
+"""
+
+_ACTIVE = """
+    // a bit for each number that is positive
+    auto active = [](vector x) {
+        const vector zero = {};
+#if defined(__AVX512F__) || !defined(__AVX__)
+        wp::uint32 word = 0;
+        for (int i = 0; i < lanes; ++i)
+            word |= (wp::uint32)(x[i] > 0.0f) << i;
+        return word;
+#else
+        return (wp::uint32)__builtin_ia32_movmskps256((decltype(x))(x > zero));
+#endif
+    };
+"""
 
 # `warpslam.kernels.decoder.embedding`, a register of channels at a time.
 _EMBED = """
@@ -104,29 +123,9 @@ _FORWARD = """
     return h;
 """
 
-_SIZE = """
-    constexpr int size = sizeof(samples.c) / sizeof(samples.c[0]);
-"""
-
-_ACTIVE = """
-    // a bit for each number that is positive
-    auto active = [](vector x) {
-        const vector zero = {};
-#if defined(__AVX512F__) || !defined(__AVX__)
-        wp::uint32 word = 0;
-        for (int i = 0; i < lanes; ++i)
-            word |= (wp::uint32)(x[i] > 0.0f) << i;
-        return word;
-#else
-        return (wp::uint32)__builtin_ia32_movmskps256((decltype(x))(x > zero));
-#endif
-    };
-"""
-
-
 # Of an adjoint: the layers from the last to the first.
 _BACKWARD = """
-    const float* rows_of_weights = (const float*)decoder.T.data;
+    const float* weights = (const float*)decoder.T.data;
     // what the gradients of W_k and V_k need; those of b_k and d_k at once
     auto store = [&](int column, const float* a) {
         for (int p = 0; p < size; ++p)
@@ -143,6 +142,7 @@ _BACKWARD = """
             *(vector*)(sum + i) = *(vector*)(sum + i) + total;
         }
     };
+    // a bit a lane
     typedef int numbers __attribute__((vector_size(4 * lanes)));
     numbers bit;
     for (int i = 0; i < lanes; ++i)
@@ -162,7 +162,7 @@ _BACKWARD = """
                 *(vector*)(a + 32 * p + i) = ((bit & (int)(word >> i)) != none) ? x : zero;
             }
         }
-        add_product(&result.data[0][0], g, rows_of_weights + 32 * (V_T + 32 * k));
+        add_product(&result.data[0][0], g, weights + 32 * (V_T + 32 * k));
         if (KEEPS && kept.wanted) {
             store(5 + k, g);
             store(k, a);
@@ -172,11 +172,12 @@ _BACKWARD = """
         if (k > 0) {
             for (int i = 0; i < 32 * size; ++i)
                 g[i] = 0.0f;
-            add_product(g, a, rows_of_weights + 32 * (W1_T + 32 * (k - 1)));
+            add_product(g, a, weights + 32 * (W1_T + 32 * (k - 1)));
         }
     }
     return result;
 """
+
 
 def cpu_forward_layers(build: Any, *, two_features: bool, keeps_activations: bool) -> Any:
     """`forward_layers` for the CPU."""
