@@ -9,6 +9,7 @@ Adjoint, for g_4 = d_h_4:  a_k = g_k where a_k > 0,  g_{k-1} = W_k^T a_k,  dc = 
 import warp as wp
 
 from warpslam.kernels.decoder.blocks import Build
+from warpslam.kernels.decoder.cpu_layers import cpu_backward_layers, cpu_forward_layers
 from warpslam.kernels.decoder.layout import (
     BIAS,
     E0,
@@ -37,6 +38,8 @@ def forward_layers(
     two_features: c is the level's own feature and that of the middle level (fine).
     keeps_activations: h_0..h_4 are stored where they are wanted (colour).
     """
+    if build.on_cpu:
+        return cpu_forward_layers(build, two_features=two_features, keeps_activations=keeps_activations)
     Block, Indices, Positions = build.Block, build.Indices, build.Positions
     matvec, fill, relu, embed = build.matvec, build.fill, build.relu, build.embed
     store_bits, store_rows = build.store_bits, build.store_rows
@@ -73,6 +76,8 @@ def forward_layers(
 
 def backward_layers(build: Build, name: str, *, keeps_gradients: bool = False) -> wp.Function:
     """(dc, a_0, a_3) of a block from g_4; keeps_gradients: a_k and g_k are stored, too (colour)."""
+    if build.on_cpu:
+        return cpu_backward_layers(build, name, keeps_gradients=keeps_gradients)
     Block, Indices = build.Block, build.Indices
     matvec, keep_active, store_rows, add_sum = build.matvec, build.keep_active, build.store_rows, build.add_sum
     on_cpu = build.on_cpu

@@ -37,7 +37,7 @@ _MATVEC = """
 """
 
 # As wide as a register of the CPU.
-_VECTOR = """
+VECTOR = """
 #ifdef __AVX512F__
     constexpr int lanes = 16;
 #else
@@ -49,39 +49,45 @@ _VECTOR = """
 # Tiles of the result whose sums stay in registers while k runs, eight vectors each: all columns at once where vectors
 # have 64 bytes, half of them where they have 32. Each number is the same sum in the same order. Called and not inlined,
 # so that the code of a decoder stays in the cache of instructions.
-_MATVEC_CPU = """
-    constexpr int size = sizeof(r.data) / sizeof(r.data[0]), samples = 4, columns = 2 * lanes;
-    static_assert(size % samples == 0, "blocks are whole tiles");
-    auto s = r;
-    auto add_product = [](float* s, const float* x, const float* weights) __attribute__((noinline)) {
-        for (int p = 0; p < size; p += samples) {
-            for (int i = 0; i < 32; i += columns) {
-                vector t[samples][2];
+ADD_PRODUCT = """
+    constexpr int samples_of_tile = 4, columns_of_tile = 2 * lanes;
+    static_assert(size % samples_of_tile == 0, "blocks are whole tiles");
+    // s += x W of 32 rows
+    auto add_product = [](float* s, const float* x, const float* rows) __attribute__((noinline)) {
+        for (int p = 0; p < size; p += samples_of_tile) {
+            for (int i = 0; i < 32; i += columns_of_tile) {
+                vector t[samples_of_tile][2];
                 #pragma unroll
-                for (int q = 0; q < samples; ++q)
+                for (int q = 0; q < samples_of_tile; ++q)
                     for (int j = 0; j < 2; ++j)
                         t[q][j] = *(const vector*)(s + 32 * (p + q) + i + j * lanes);
                 #pragma unroll 1
                 for (int k = 0; k < 32; ++k) {
-                    const vector w_0 = *(const vector*)(weights + 32 * k + i);
-                    const vector w_1 = *(const vector*)(weights + 32 * k + i + lanes);
+                    const vector w_0 = *(const vector*)(rows + 32 * k + i);
+                    const vector w_1 = *(const vector*)(rows + 32 * k + i + lanes);
                     #pragma unroll
-                    for (int q = 0; q < samples; ++q) {
+                    for (int q = 0; q < samples_of_tile; ++q) {
                         const float x_k = x[32 * (p + q) + k];
                         t[q][0] += x_k * w_0;
                         t[q][1] += x_k * w_1;
                     }
                 }
                 #pragma unroll
-                for (int q = 0; q < samples; ++q)
+                for (int q = 0; q < samples_of_tile; ++q)
                     for (int j = 0; j < 2; ++j)
                         *(vector*)(s + 32 * (p + q) + i + j * lanes) = t[q][j];
             }
         }
     };
+"""
+
+_MATVEC_CPU = """
+    constexpr int size = sizeof(r.data) / sizeof(r.data[0]);
+    ADD_PRODUCT
+    auto s = r;
     add_product(&s.data[0][0], &x.data[0][0], (const float*)(W.data + row));
     return s;
-"""
+""".replace("ADD_PRODUCT", ADD_PRODUCT)
 
 # The same tiles, of four rows of the result.
 _ADD_OUTER = """
@@ -160,7 +166,7 @@ _PUT_ROW = """
 
 def native_matvec(Block: type, *, on_cpu: bool) -> Any:
     """r + x W[row:], for blocks of four samples and multiples (CPU) and for one (CUDA)."""
-    code = _VECTOR + _MATVEC_CPU if on_cpu else _MATVEC
+    code = VECTOR + _MATVEC_CPU if on_cpu else _MATVEC
 
     # Warp takes the type of the result from a decorator that is spelt like this.
     @wp.func_native(code)
@@ -169,7 +175,7 @@ def native_matvec(Block: type, *, on_cpu: bool) -> Any:
     return matvec
 
 
-@wp.func_native(_VECTOR + _ADD_OUTER)
+@wp.func_native(VECTOR + _ADD_OUTER)
 def add_outer(
     rows: wp.array2d[Vec32], slot: int, row: int, columns: wp.array2d[Vec32], first: int, count: int, x: int, d: int
 ):
