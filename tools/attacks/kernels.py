@@ -105,7 +105,7 @@ def attempt(rng: np.random.Generator) -> str:
     largest = wp.zeros(1, dtype=float, device=CPU)
     arguments = [level.lattice, matrix(), view, image(), looked_up, vertex_depth, largest]
     wp.launch(frustum.project_vertices, rows, arguments, device=CPU)
-    wp.launch(seen.mark_seen, rows, [level.lattice, matrix(), view, image(), 0.1, chosen], device=CPU)
+    wp.launch(seen.mark_seen, rows, [0, level.lattice, matrix(), view, image(), 0.1, chosen], device=CPU)
 
     views = struct(
         visibility.Views,
@@ -117,7 +117,7 @@ def attempt(rng: np.random.Generator) -> str:
         max_front=float(rng.choice([0.3, np.inf, 1e38])),
     )
     facing = wp.zeros(COUNT, dtype=wp.uint8, device=CPU)
-    wp.launch(visibility.find_facing, COUNT, [points, vectors(), vectors(1), views, -1.0, 1.0, facing], device=CPU)
+    wp.launch(visibility.find_facing, COUNT, [0, points, vectors(), vectors(1), views, -1.0, 1.0, facing], device=CPU)
 
     counts = wp.zeros((2, 2), dtype=int, device=CPU)
     focal, center = (wp.vec2(*numbers(rng, (2,), 0.2).astype(np.float32).tolist()) for _ in range(2))

@@ -36,6 +36,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("sequence")
     parser.add_argument("--frames", type=parse_frames, default=slice(None), help="a:b:step; every tenth is held back")
     parser.add_argument("--preset", action="append", help="default, if none is given")
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="GROUP.FIELD=VALUE")
     parser.add_argument("--stride", type=int, default=2, help="render every n-th pixel")
     options = parser.parse_args(arguments)
     sequence = open_sequence(options.sequence)
@@ -44,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
     print("| map | depth L1 [cm] | missed | PSNR [dB] |")
     print("|---|---|---|---|")
     for name in options.preset or ["default"]:
-        slam = Slam(sequence.intrinsics, Config.from_preset(name), timing=sequence.timing)
+        slam = Slam(sequence.intrinsics, Config.from_preset(name, options.overrides), timing=sequence.timing)
         feed(slam, sequence, (index for index in indices if index not in held))
         slam.finish()
         poses = iter(slam.trajectory.poses)

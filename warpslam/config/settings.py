@@ -252,11 +252,11 @@ class SupervisionConfig(_Group):
     front: float = Field(0.1, gt=0, description="the band begins so far before the measured surface [m]")
     behind: float = Field(0.05, gt=0, description="and ends so far behind it [m]")
     behind_weight: float = Field(0.5, ge=0, le=1, description="weight of samples behind the surface")
-    free_samples: int = Field(4, ge=1, le=64, description="samples of a ray before the band")
+    free_samples: int = Field(3, ge=1, le=64, description="samples of a ray before the band")
     edge_samples: int = Field(
         2, ge=0, le=64, description="of these, at the depth of pixels beside it, where that is smaller"
     )
-    near_samples: int = Field(8, ge=1, le=64, description="samples of a ray in the band; one more lies at its depth")
+    near_samples: int = Field(3, ge=1, le=64, description="samples of a ray in the band; one more lies at its depth")
     replay_share: float = Field(0.5, ge=0, lt=1, description="share of rays of earlier keyframes that see the same")
     young_updates: int = Field(
         20, ge=1, description="rays are drawn to where a vertex was updated less often than this"

@@ -236,6 +236,7 @@ def init_normal(start: Start, i: int, j: int, k: int) -> Vec32:
 
 @wp.kernel(enable_backward=False)
 def fill_grid(
+    layer: int,
     lattice: Lattice,
     first: wp.vec3i,
     start: Start,
@@ -245,10 +246,11 @@ def fill_grid(
     features: wp.array[Vec32],
     seen: wp.array[wp.uint8],
 ):
-    """Fill a dense grid of any extent: rows of the old grid are kept, the others begin anew (``first``: world index of
-    vertex 0).
+    """Fill a dense grid of any extent from a layer along x on: rows of the old grid are kept, the others begin anew
+    (``first``: world index of vertex 0).
     """
     i, j, k = wp.tid()
+    i += layer
     row = row_of(lattice, i, j, k)
     a = i - shift[0]
     b = j - shift[1]

@@ -41,6 +41,7 @@ def behind_surface(p: wp.vec3, T_camera_world: wp.mat44, camera: Camera, image: 
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def mark_seen(
+    start: int,
     lattice: Lattice,
     T_camera_world: wp.mat44,
     camera: Camera,
@@ -49,7 +50,7 @@ def mark_seen(
     seen: wp.array[wp.uint8],
 ):
     """Vertices in view that lie in front of the measured surface or less than ``reach`` behind it."""
-    row = lattice.shared + wp.tid()
+    row = lattice.shared + start + wp.tid()
     if behind_surface(row_position(lattice, row), T_camera_world, camera, image) <= reach:
         seen[row] = wp.uint8(1)
 

@@ -197,6 +197,7 @@ def adam_touched_entries(
 
 @wp.kernel(module=MODULE)
 def move_rows(
+    layer: int,
     old_lattice: Lattice,
     shift: wp.vec3i,
     lattice: Lattice,
@@ -205,8 +206,11 @@ def move_rows(
     moments: wp.array2d[Vec32],
     updates: wp.array[int],
 ):
-    """State of rows that were updated, from a dense grid to the one that it grew to, by ``shift`` vertices."""
+    """State of rows that were updated, from a layer along x on of a dense grid to the one that it grew to, by ``shift``
+    vertices.
+    """
     i, j, k = wp.tid()
+    i += layer
     old = row_of(old_lattice, i, j, k)
     if old_updates[old] > 0:
         row = row_of(lattice, i + shift[0], j + shift[1], k + shift[2])

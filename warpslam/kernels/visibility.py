@@ -90,6 +90,7 @@ def signed_distance(
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def classify_points(
+    layer: int,
     first: wp.vec3i,
     voxel: float,
     visible: wp.array[wp.int32],
@@ -98,7 +99,9 @@ def classify_points(
     band: float,
     state: wp.array3d[wp.uint8],
 ):
+    """State of the points of a box from a layer along x on."""
     i, j, k = wp.tid()
+    i += layer
     p = wp.vec3(float(first[0] + i) * voxel, float(first[1] + j) * voxel, float(first[2] + k) * voxel)
     observed = wp.bool(False)
     near = wp.bool(False)
@@ -115,6 +118,7 @@ def classify_points(
 
 @wp.kernel(module=MODULE, enable_backward=False)
 def find_facing(
+    start: int,
     points: wp.array[wp.vec3],
     normals: wp.array[wp.vec3],
     centers: wp.array[wp.vec3],
@@ -123,7 +127,7 @@ def find_facing(
     most: float,
     facing: wp.array[wp.uint8],
 ):
-    n = wp.tid()
+    n = start + wp.tid()
     for view in range(centers.shape[0]):
         ray = centers[view] - points[n]
         if wp.dot(normals[n], ray) > 0.0:

@@ -13,6 +13,7 @@ from warpslam.camera import Intrinsics
 from warpslam.field.arrays import projection
 from warpslam.kernels import frustum, seen
 from warpslam.kernels.grid import Lattice
+from warpslam.runtime.launching import Launcher, Step
 from warpslam.runtime.phases import phase
 
 if TYPE_CHECKING:
@@ -72,8 +73,12 @@ def mark_seen(grid: FeatureGrid, camera: Intrinsics, T_world_camera: np.ndarray,
         grid: `FeatureGrid.seen` becomes 1 there, and stays what it is elsewhere.
         camera, T_world_camera, depth: As in `select_in_frustum`.
     """
-    inputs = [grid.lattice, *projection(camera, T_world_camera), depth, REACH * grid.spacing]
-    wp.launch(seen.mark_seen, grid.own_rows, inputs, [grid.seen], device=grid.device, record_tape=False)
+    inputs = [grid.lattice, *projection(camera, T_world_camera), depth, REACH * grid.spacing, grid.seen]
+
+    def steps(first: int, stop: int, slot: int) -> list[Step]:
+        return [(seen.mark_seen, stop - first, [first, *inputs])]
+
+    Launcher(grid.device).slices(grid.own_rows, steps)
 
 
 def measured_extent(

@@ -213,7 +213,7 @@ def touched_vertices(
     mask = wp.zeros(count, dtype=wp.uint8, device=grid.device)
     for depth, T_world_camera in views:
         image = wp.array(depth, dtype=float, device=grid.device)
-        inputs = [lattice, *projection(camera, T_world_camera), image, REACH * grid.spacing]
+        inputs = [0, lattice, *projection(camera, T_world_camera), image, REACH * grid.spacing]
         wp.launch(seen.mark_seen, count, inputs, [mask], device=grid.device, record_tape=False)
     touched = mask.numpy().reshape(grid.shape) != 0
     for axis in range(3):

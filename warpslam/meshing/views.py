@@ -19,6 +19,7 @@ from warpslam.camera import Intrinsics
 from warpslam.errors import InputError, MeshError
 from warpslam.kernels.visibility import NEAR, Views, classify_points, find_facing, find_reached
 from warpslam.runtime.environment import named_device
+from warpslam.runtime.launching import Launcher, Step
 from warpslam.scene.mapped_views import ObservedView
 
 # The reference enlarges images by 1000 px; in focal lengths of its Replica camera (600 px), as images have many sizes.
@@ -43,6 +44,7 @@ class Evidence:
         if not views:
             raise MeshError("no view with depth to mesh from; pass the keyframes of a sequence that has been mapped")
         self.device = named_device(device)
+        self._launcher = Launcher(self.device)
         self.behind, self.band = behind, band
         self.max_behind = _MAX_BEHIND_ALONG_Z * behind
         self.max_front = _MAX_FRONT_ALONG_Z * band
@@ -95,20 +97,14 @@ class Evidence:
         """
         padded = tuple(n + 2 for n in shape)
         state = wp.zeros(padded, dtype=wp.uint8, device=self.device)
-        wp.launch(
-            classify_points,
-            dim=padded,
-            inputs=[
-                wp.vec3i(*(int(i) - 1 for i in start)),
-                voxel,
-                wp.array(visible, dtype=wp.int32, device=self.device),
-                self._views,
-                self.behind,
-                self.band,
-            ],
-            outputs=[state],
-            device=self.device,
-        )
+        corner = wp.vec3i(*(int(i) - 1 for i in start))
+        inputs = [corner, voxel, wp.array(visible, dtype=wp.int32, device=self.device), self._views]
+
+        def steps(first: int, stop: int, slot: int) -> list[Step]:
+            dim = (stop - first, *padded[1:])
+            return [(classify_points, dim, [first, *inputs, self.behind, self.band, state])]
+
+        self._launcher.slices(padded[0], steps)
         states = state.numpy()
         near = states == NEAR
         near = near[:-2] | near[1:-1] | near[2:]
@@ -142,13 +138,11 @@ class Evidence:
         """
         facing = wp.zeros(len(points), dtype=wp.uint8, device=self.device)
         vectors = [wp.array(x, dtype=wp.vec3, device=self.device) for x in (points, normals, self.centers)]
-        wp.launch(
-            find_facing,
-            dim=len(points),
-            inputs=[*vectors, self._views, least, most],
-            outputs=[facing],
-            device=self.device,
-        )
+
+        def steps(first: int, stop: int, slot: int) -> list[Step]:
+            return [(find_facing, stop - first, [first, *vectors, self._views, least, most, facing])]
+
+        self._launcher.slices(len(points), steps)
         return facing.numpy().astype(bool)
 
 

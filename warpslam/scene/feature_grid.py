@@ -11,6 +11,7 @@ from warpslam.field.arrays import struct
 from warpslam.field.decoders import FEATURE_SIZE, LEVELS
 from warpslam.kernels import grid as grid_kernels
 from warpslam.kernels.grid import Lattice, Level, Start, Vec32
+from warpslam.runtime.launching import Launcher, Step
 
 
 @dataclass(frozen=True)
@@ -110,14 +111,13 @@ class FeatureGrid:
         self.lattice = self._lattice()
         self.features = wp.empty(self.row_count, dtype=Vec32, device=self.device)
         self.seen = wp.empty(self.row_count, dtype=wp.uint8, device=self.device)
-        wp.launch(
-            grid_kernels.fill_grid,
-            dim=shape,
-            inputs=[self.lattice, wp.vec3i(*first), self._start(), old, old_seen, wp.vec3i(*shift)],
-            outputs=[self.features, self.seen],
-            device=self.device,
-            record_tape=False,
-        )
+        inputs = [self.lattice, wp.vec3i(*first), self._start(), old, old_seen, wp.vec3i(*shift)]
+
+        def steps(begin: int, end: int, slot: int) -> list[Step]:
+            dim = (end - begin, *shape[1:])
+            return [(grid_kernels.fill_grid, dim, [begin, *inputs, self.features, self.seen])]
+
+        Launcher(self.device).slices(shape[0], steps)
 
     def renew(self, rows: np.ndarray) -> None:
         """Some rows, int (n,), become again what a new vertex is; `seen` says so, too."""
