@@ -31,13 +31,13 @@ def _paper(tracking: dict[str, Any] | None = None, **groups: Any) -> dict[str, A
     }
 
 
-_PAPER_GRID = {"fine_spacing": 0.16, "color_spacing": 0.16}
+_PAPER_GRID = {"fine_spacing": 0.16, "color_spacing": 0.16, "layout": "dense"}
 _BY_RENDERING: dict[str, Any] = {
     "grid": _PAPER_GRID,
     "mapping": {**_RENDERING, "first_iterations": 500},
     "meshing": {"level_set": -0.1},
 }
-_TUM_GRID = {"middle_spacing": 0.16, "fine_spacing": 0.08, "color_spacing": 0.08}
+_TUM_GRID = {"middle_spacing": 0.16, "fine_spacing": 0.08, "color_spacing": 0.08, "layout": "dense"}
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "live": {"mapping": {"every": 1, "iterations": 3}},

@@ -45,10 +45,10 @@ class GridConfig(_Group):
     fine_std: float = Field(0.0001, ge=0, description="standard deviation of the initial fine features")
     color_std: float = Field(0.01, ge=0, description="standard deviation of the initial colour features")
     layout: Literal["dense", "blocks"] = Field(
-        "dense",
-        description="rows of the middle, fine and colour level: one for every vertex of the map's box; or in blocks of "
-        "4 x 4 x 4 vertices where something was seen, so that memory follows that; same results until "
-        "the final refinement with the direct loss",
+        "blocks",
+        description="rows of the middle, fine and colour level: in blocks of 4 x 4 x 4 vertices where something was "
+        "seen, so that memory follows that; or one for every vertex of the map's box (paper); same results until the "
+        "final refinement with the direct loss",
     )
     margin: float = Field(0.6, gt=0, description="the map reaches this far beyond what was seen [m]")
     max_depth: float = Field(10.0, gt=0, description="measurements beyond this do not count [m]")
@@ -265,7 +265,9 @@ class SupervisionConfig(_Group):
     fine_rate: float = Field(0.02, gt=0, description="learning rate of fine features")
     color_rate: float = Field(0.01, gt=0, description="learning rate of colour features")
     decoder_rate: float = Field(0.003, gt=0, description="learning rate of the colour decoder, where it is trained")
-    color_reach: float = Field(0.02, ge=0, description="samples get a colour so far from the surface [m]")
+    color_reach: float = Field(
+        0.0, ge=0, description="samples get a colour so far from the surface [m]; 0 = that at the measured depth alone"
+    )
 
 
 class DirectConfig(_Group):

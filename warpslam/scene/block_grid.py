@@ -14,8 +14,10 @@ from warpslam.kernels.grid import BLOCK, BLOCK_ROWS, Lattice, Vec32
 from warpslam.runtime.launching import Launcher, Step
 from warpslam.scene.feature_grid import FeatureGrid, GridState
 
-GROWTH = 1.5
-"""Arrays grow at least by this: all copying together is then thrice what is copied, at most."""
+GROWTH = {"cpu": 4.0, "cuda": 1.5}
+"""Arrays grow at least by this: all copying together is then thrice what is copied, at most. On the CPU rows that are not
+written to take no memory, and there is little to copy.
+"""
 
 Images = tuple[wp.array, wp.array, wp.array]
 
@@ -153,7 +155,7 @@ class BlockGrid(FeatureGrid):
         have = old[0].shape[0]
         if rows <= have and have >= BLOCK_ROWS:
             return
-        blocks = max(rows, int(GROWTH * have)) // BLOCK_ROWS
+        blocks = max(rows, int(GROWTH["cuda" if self.device.is_cuda else "cpu"] * have)) // BLOCK_ROWS
         self.features = lazy_zeros((BLOCK_ROWS * blocks,), self.device)
         self.seen = wp.zeros(BLOCK_ROWS * blocks, dtype=wp.uint8, device=self.device)
         self._corners = wp.zeros(blocks, dtype=wp.vec3i, device=self.device)
