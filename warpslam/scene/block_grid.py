@@ -15,8 +15,8 @@ from warpslam.runtime.launching import Launcher, Step
 from warpslam.scene.feature_grid import FeatureGrid, GridState
 
 GROWTH = {"cpu": 4.0, "cuda": 1.5}
-"""Arrays grow at least by this: all copying together is then thrice what is copied, at most. On the CPU rows that are not
-written to take no memory, and there is little to copy.
+"""Arrays grow at least by this: all copying together is then thrice what is copied, at most. On the CPU rows that are
+not written to take no memory.
 """
 
 Images = tuple[wp.array, wp.array, wp.array]
