@@ -1,4 +1,5 @@
 """The five layers of the decoders with coordinates, written once: forward for middle, fine and colour, and the adjoint.
+Here for CUDA; for the CPU in `warpslam.kernels.decoder.cpu_layers`.
 
     a_0 = W_0 e + b_0,  a_3 = W_3 [e, h_2] + b_3,  a_k = W_k h_{k-1} + b_k
     h_k = relu(a_k) + V_k c + d_k
@@ -79,17 +80,12 @@ def backward_layers(build: Build, name: str, *, keeps_gradients: bool = False) -
     if build.on_cpu:
         return cpu_backward_layers(build, name, keeps_gradients=keeps_gradients)
     Block, Indices = build.Block, build.Indices
-    matvec, keep_active, store_rows, add_sum = build.matvec, build.keep_active, build.store_rows, build.add_sum
-    on_cpu = build.on_cpu
+    matvec, keep_active, store_rows = build.matvec, build.keep_active, build.store_rows
 
-    def note(k: int, g: Block, a: Block, slot: int, rows: Indices, kept: WeightGradient):
-        """What the gradients of W_k and V_k need; on the CPU those of b_k and d_k at once."""
+    def note(k: int, g: Block, a: Block, rows: Indices, kept: WeightGradient):
+        """What the gradients of W_k and V_k need."""
         store_rows(kept.layer_grad, rows, 5 + k, g, kept.wanted)
         store_rows(kept.layer_grad, rows, k, a, kept.wanted)
-        if wp.static(on_cpu):
-            if kept.wanted != 0:
-                add_sum(kept.rows, slot, BIAS + k, a)
-                add_sum(kept.rows, slot, FC_BIAS + k, g)
 
     note_k = build.func(note, f"{name}_note")
 
@@ -99,27 +95,27 @@ def backward_layers(build: Build, name: str, *, keeps_gradients: bool = False) -
         a4 = keep_active(g4, decoder.bits, samples, 4)
         dc = matvec(Block(), g4, decoder.T, V_T + 128)
         if wp.static(keeps_gradients):
-            note_k(4, g4, a4, slot, rows, kept)
+            note_k(4, g4, a4, rows, kept)
         g3 = matvec(Block(), a4, decoder.T, W4_T)
         a3 = keep_active(g3, decoder.bits, samples, 3)
         dc = matvec(dc, g3, decoder.T, V_T + 96)
         if wp.static(keeps_gradients):
-            note_k(3, g3, a3, slot, rows, kept)
+            note_k(3, g3, a3, rows, kept)
         g2 = matvec(Block(), a3, decoder.T, W3_T)
         a2 = keep_active(g2, decoder.bits, samples, 2)
         dc = matvec(dc, g2, decoder.T, V_T + 64)
         if wp.static(keeps_gradients):
-            note_k(2, g2, a2, slot, rows, kept)
+            note_k(2, g2, a2, rows, kept)
         g1 = matvec(Block(), a2, decoder.T, W2_T)
         a1 = keep_active(g1, decoder.bits, samples, 1)
         dc = matvec(dc, g1, decoder.T, V_T + 32)
         if wp.static(keeps_gradients):
-            note_k(1, g1, a1, slot, rows, kept)
+            note_k(1, g1, a1, rows, kept)
         g0 = matvec(Block(), a1, decoder.T, W1_T)
         a0 = keep_active(g0, decoder.bits, samples, 0)
         dc = matvec(dc, g0, decoder.T, V_T)
         if wp.static(keeps_gradients):
-            note_k(0, g0, a0, slot, rows, kept)
+            note_k(0, g0, a0, rows, kept)
         return dc, a0, a3
 
     return build.func(layers_backward, f"{name}_layers_backward")
