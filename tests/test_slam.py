@@ -69,8 +69,8 @@ def test_two_runs_are_bit_identical(frames, optimizer):
         slam.finish()
     np.testing.assert_array_equal(a.trajectory.poses, b.trajectory.poses)
     for level in a.scene.grids:
-        np.testing.assert_array_equal(a.scene.grids[level].features.numpy(), b.scene.grids[level].features.numpy())
-        assert not np.array_equal(a.scene.grids[level].features.numpy(), c.scene.grids[level].features.numpy())
+        np.testing.assert_array_equal(a.scene.grids[level].state().features, b.scene.grids[level].state().features)
+        assert not np.array_equal(a.scene.grids[level].state().features, c.scene.grids[level].state().features)
     assert np.array_equal(a.trajectory.poses[1:4], c.trajectory.poses[1:4]) == (optimizer == "direct")
 
 
@@ -257,12 +257,12 @@ def test_only_vertices_in_the_frustum_change(frames):
     """A mapping call leaves every vertex behind the camera as it was, to the bit."""
     slam = run(frames[:1], "mapping.coarse=false", "grid.layout=dense")
     grid = slam.scene.grids["middle"]
-    before = grid.features.numpy().copy()
+    before = grid.state().features.copy()
     slam.mapper.start_frame(slam.images, 1, slam.history.pose(0), slam.keyframes)()
     index = np.stack(np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij"), -1).reshape(-1, 3)
     camera = (grid.spacing * (grid.first + index) - frames[0].T_world_camera[:3, 3]) @ frames[0].T_world_camera[:3, :3]
     behind = (camera[:, 2] < 0) & (np.linalg.norm(camera, axis=1) > 0.5)
-    changed = (grid.features.numpy() != before).any(axis=1)
+    changed = (grid.state().features != before).any(axis=1)
     assert changed.any() and behind.any()
     assert not changed[behind].any()
 
@@ -270,10 +270,10 @@ def test_only_vertices_in_the_frustum_change(frames):
 def test_frame_without_depth_is_skipped_and_the_run_goes_on(frames):
     """Status SKIPPED with a reason; the map is untouched; the next frame is tracked."""
     slam = run(frames[:2])
-    features = slam.scene.grids["middle"].features.numpy().copy()
+    features = slam.scene.grids["middle"].state().features.copy()
     result = slam.step(frames[2].rgb, np.zeros_like(frames[2].depth))
     assert result.status == "SKIPPED" and "depth" in result.message
-    np.testing.assert_array_equal(slam.scene.grids["middle"].features.numpy(), features)
+    np.testing.assert_array_equal(slam.scene.grids["middle"].state().features, features)
     assert slam.step(frames[3].rgb, frames[3].depth).status == "OK"
     assert slam.trajectory.status == ["OK", "OK", "SKIPPED", "OK"]
 
@@ -281,11 +281,11 @@ def test_frame_without_depth_is_skipped_and_the_run_goes_on(frames):
 def test_lost_frame_freezes_the_map(frames):
     """Depth that disagrees with the map gives LOST, says why, and changes no feature."""
     slam = run(frames[:1], "tracking.lost_depth_error=0.15", "mapping.every=1", "mapping.first_iterations=150")
-    features = slam.scene.grids["middle"].features.numpy().copy()
+    features = slam.scene.grids["middle"].state().features.copy()
     noise = np.random.default_rng(0).uniform(0.3, 5.0, frames[1].depth.shape).astype(np.float32)
     result = slam.step(frames[1].rgb, noise)
     assert result.status == "LOST" and result.message
-    np.testing.assert_array_equal(slam.scene.grids["middle"].features.numpy(), features)
+    np.testing.assert_array_equal(slam.scene.grids["middle"].state().features, features)
 
 
 def test_bad_depth_values_never_enter_the_map(frames):
@@ -295,7 +295,7 @@ def test_bad_depth_values_never_enter_the_map(frames):
     slam = new_slam()
     slam.step(frames[0].rgb, depth, T_world_camera=frames[0].T_world_camera)
     for grid in slam.scene.grids.values():
-        assert np.isfinite(grid.features.numpy()).all()
+        assert np.isfinite(grid.state().features).all()
 
 
 def test_arrays_of_any_kind_give_the_same_result(frames):
@@ -393,13 +393,13 @@ def test_bad_frames_are_skipped_and_nothing_is_lost(frames, optimizer):
     loss = {"direct": "direct", "gauss_newton": "rendering"}[optimizer]
     tracked = f"tracking.optimizer={optimizer}", f"mapping.loss={loss}"
     good, slam = run(frames[:2], *tracked), run(frames[:2], *tracked)
-    features = slam.scene.grids["middle"].features.numpy().copy()
+    features = slam.scene.grids["middle"].state().features.copy()
     faults = bad_frames(frames[2])
     for name, (arguments, message) in faults.items():
         result = slam.step(**{"rgb": frames[2].rgb, "depth": frames[2].depth, "timestamp": 0.05, **arguments})
         assert result.status == "SKIPPED" and re.search(message, result.message), f"{name}: {result}"
         assert np.isfinite(result.timestamp)
-    np.testing.assert_array_equal(slam.scene.grids["middle"].features.numpy(), features)
+    np.testing.assert_array_equal(slam.scene.grids["middle"].state().features, features)
     assert slam.trajectory.status == ["OK", "OK"] + ["SKIPPED"] * len(faults)
     np.testing.assert_array_equal(slam.trajectory.poses[:2], good.trajectory.poses[:2])
     if optimizer == "direct":
@@ -483,7 +483,7 @@ def test_a_pose_far_away_costs_one_frame():
     slam = new_slam("tracking.use_given_poses=true", "grid.max_gigabytes=1")
     frame = sequence[0]
     slam.step(frame.rgb, frame.depth, 0.0, frame.T_world_camera)
-    bounds, features = slam.scene.bounds, slam.scene.grids["fine"].features.numpy().copy()
+    bounds, features = slam.scene.bounds, slam.scene.grids["fine"].state().features.copy()
     for n, metres in enumerate((5e5, 1e38, 9e3)):
         frame = sequence[2]
         far = frame.T_world_camera.copy()
@@ -491,7 +491,7 @@ def test_a_pose_far_away_costs_one_frame():
         result = slam.step(frame.rgb, frame.depth, 1.0 + n, far)
         assert result.status == "SKIPPED" and "T_world_camera" in result.message
         np.testing.assert_array_equal(slam.scene.bounds, bounds)
-        np.testing.assert_array_equal(slam.scene.grids["fine"].features.numpy(), features)
+        np.testing.assert_array_equal(slam.scene.grids["fine"].state().features, features)
     frame = sequence[2]
     assert slam.step(frame.rgb, frame.depth, 9.0, frame.T_world_camera).status == "OK"
 

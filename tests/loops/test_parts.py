@@ -81,7 +81,7 @@ def test_it_is_mapped_apart_and_joined(frames, tmp_path, mapping):
     np.testing.assert_array_equal(resumed.trajectory.poses, slam.trajectory.poses)
     if mapping:
         for level, grid in slam.scene.grids.items():
-            np.testing.assert_array_equal(resumed.scene.grids[level].features.numpy(), grid.features.numpy(), level)
+            np.testing.assert_array_equal(resumed.scene.grids[level].state().features, grid.state().features, level)
         low, _ = slam.scene.bounds
         depth = frames[48][1]
         points = CAMERA.backproject(np.full(5, 80), np.arange(40, 90, 10), depth[40:90:10, 80].astype(float))

@@ -47,7 +47,7 @@ def saved(tmp_path_factory):
 
 
 def features(slam: Slam, level: str = "fine") -> np.ndarray:
-    return slam.scene.grids[level].features.numpy()
+    return slam.scene.grids[level].state().features
 
 
 def test_refinement_goes_on_with_new_draws(saved):

@@ -39,7 +39,7 @@ def mapping_threads() -> list[str]:
 
 
 def features(slam: Slam) -> dict[str, np.ndarray]:
-    return {level: grid.features.numpy().copy() for level, grid in slam.scene.grids.items()}
+    return {level: grid.state().features.copy() for level, grid in slam.scene.grids.items()}
 
 
 class Gate:
@@ -88,7 +88,7 @@ def test_waiting_after_every_frame_equals_strict(frames):
         slam.finish()
     np.testing.assert_array_equal(overlapped.trajectory.poses, strict.trajectory.poses)
     for level, values in features(strict).items():
-        np.testing.assert_array_equal(overlapped.scene.grids[level].features.numpy(), values)
+        np.testing.assert_array_equal(overlapped.scene.grids[level].state().features, values)
     for name, tensor in strict.scene.decoders["color"].unpack().tensors.items():
         np.testing.assert_array_equal(overlapped.scene.decoders["color"].unpack().tensors[name], tensor)
     for ours, theirs in zip(overlapped.keyframes, strict.keyframes, strict=True):
@@ -105,7 +105,7 @@ def test_tracking_goes_on_while_the_mapper_works(frames, gated):
     assert step(slam, frames[3]).status == "OK"
     assert slam.scheduler.version == version == 1
     for level, values in before.items():
-        np.testing.assert_array_equal(slam.scene.grids[level].features.numpy(), values)
+        np.testing.assert_array_equal(slam.scene.grids[level].state().features, values)
     gate.open.set()
     slam.wait()
     assert slam.scheduler.version == 2
@@ -114,8 +114,8 @@ def test_tracking_goes_on_while_the_mapper_works(frames, gated):
         step(waited, frame)
         waited.wait()
     for level, values in features(waited).items():
-        np.testing.assert_array_equal(slam.scene.grids[level].features.numpy(), values)
-    assert not np.array_equal(slam.scene.grids["middle"].features.numpy(), before["middle"])
+        np.testing.assert_array_equal(slam.scene.grids[level].state().features, values)
+    assert not np.array_equal(slam.scene.grids["middle"].state().features, before["middle"])
 
 
 @pytest.mark.parametrize("optimizer", ["adam", "gauss_newton"])
@@ -148,7 +148,7 @@ def test_mapper_and_tracker_leave_each_other_alone(frames, monkeypatch, optimize
     for pose in poses:
         np.testing.assert_array_equal(pose, expected)
     for level, values in features(alone).items():
-        np.testing.assert_array_equal(together.scene.grids[level].features.numpy(), values)
+        np.testing.assert_array_equal(together.scene.grids[level].state().features, values)
     np.testing.assert_array_equal(together.trajectory.poses, alone.trajectory.poses)
 
 
@@ -217,7 +217,7 @@ def test_map_grows_beside_tracking(frames, monkeypatch):
     slam.wait()
     assert slam.scene.grids["middle"].row_count > rows and (slam.scene.bounds[1] >= high + 2.0).all()
     for level, grid in slam.mapper.scene.grids.items():
-        np.testing.assert_array_equal(slam.scene.grids[level].features.numpy(), grid.features.numpy())
+        np.testing.assert_array_equal(slam.scene.grids[level].state().features, grid.state().features)
         assert slam.scene.grids[level].features.ptr != grid.features.ptr
     assert step(slam, frames[2]).status == "OK"
 
@@ -243,12 +243,12 @@ def test_failure_of_the_mapper_surfaces_once(frames, gated, tmp_path, call):
         calls[call]()
     assert len(slam.trajectory.poses) == count and not mapping_threads()
     for level, values in before.items():
-        np.testing.assert_array_equal(slam.scene.grids[level].features.numpy(), values)
+        np.testing.assert_array_equal(slam.scene.grids[level].state().features, values)
     gate.error = None
     for frame in frames[3:6]:
         assert step(slam, frame).status == "OK"
     slam.finish()
-    assert np.isfinite(slam.scene.grids["middle"].features.numpy()).all()
+    assert np.isfinite(slam.scene.grids["middle"].state().features).all()
 
 
 def test_interrupt_while_waiting_loses_nothing(frames, gated, monkeypatch):
@@ -276,7 +276,7 @@ def test_finish_leaves_no_thread_and_maps_the_last_frame(frames):
     assert not mapping_threads() and {"mapping", "refinement"} <= set(timings)
     assert slam._mapped == 7
     for level, grid in slam.mapper.scene.grids.items():
-        np.testing.assert_array_equal(slam.scene.grids[level].features.numpy(), grid.features.numpy())
+        np.testing.assert_array_equal(slam.scene.grids[level].state().features, grid.state().features)
 
 
 def test_saving_waits_and_a_loaded_map_goes_on(frames, gated, tmp_path):
@@ -290,7 +290,7 @@ def test_saving_waits_and_a_loaded_map_goes_on(frames, gated, tmp_path):
     loaded = Slam.load(tmp_path / "map", "cpu")
     assert isinstance(loaded.scheduler, Overlapped)
     for level, values in features(slam).items():
-        np.testing.assert_array_equal(loaded.scene.grids[level].features.numpy(), values)
+        np.testing.assert_array_equal(loaded.scene.grids[level].state().features, values)
     for other in (slam, loaded):
         for frame in frames[4:6]:
             step(other, frame)
@@ -300,7 +300,7 @@ def test_saving_waits_and_a_loaded_map_goes_on(frames, gated, tmp_path):
 
 def test_memory_limit_counts_both_maps(frames):
     """The mapper's map refuses to grow beyond what the tracker's copy leaves of the limit."""
-    slam = new_slam()
+    slam = new_slam("grid.layout=dense")
     step(slam, frames[0])
     low, high = slam.scene.bounds
     alone, beside = slam.scene.gigabytes(low, high), slam.mapper.scene.gigabytes(low, high)

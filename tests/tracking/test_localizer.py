@@ -82,13 +82,13 @@ def test_camera_stays_lost_without_the_keyframe_search(sequence, saved, optimize
         pytest.skip("direct tracking always searches")
     slam = Slam.load(saved, "cpu")
     slam.config.tracking.relocalization = False
-    features = slam.scene.grids["middle"].features.numpy().copy()
+    features = slam.scene.grids["middle"].state().features.copy()
     last, keyframes = slam.trajectory.poses[-1], len(slam.keyframes)
     frame = sequence[BACK_AT]
     result = slam.step(frame.rgb, frame.depth, frame.timestamp)
     assert result.status == "LOST" and result.message
     np.testing.assert_allclose(result.T_world_camera, last, atol=1e-12)
-    np.testing.assert_array_equal(slam.scene.grids["middle"].features.numpy(), features)
+    np.testing.assert_array_equal(slam.scene.grids["middle"].state().features, features)
     assert len(slam.keyframes) == keyframes
 
 
@@ -110,7 +110,7 @@ def test_localize_only_leaves_the_map_alone(sequence, saved, optimizer):
     """
     confirmed = BACK_AT + (3 if optimizer == "direct" else 0)
     slam = Slam.load(saved, "cpu", localize_only=True)
-    before = {level: grid.features.numpy().copy() for level, grid in slam.scene.grids.items()}
+    before = {level: grid.state().features.copy() for level, grid in slam.scene.grids.items()}
     keyframes, bounds = len(slam.keyframes), [side.copy() for side in slam.scene.bounds]
     for n in range(BACK_AT, BACK_AT + 6):
         frame = sequence[n]
@@ -121,7 +121,7 @@ def test_localize_only_leaves_the_map_alone(sequence, saved, optimizer):
             assert result.status == "OK" and error(result, frame) < 0.03
     assert slam.finish() == {}
     for level, grid in slam.scene.grids.items():
-        np.testing.assert_array_equal(grid.features.numpy(), before[level])
+        np.testing.assert_array_equal(grid.state().features, before[level])
     assert len(slam.keyframes) == keyframes
     np.testing.assert_array_equal(slam.scene.bounds, bounds)
 
