@@ -83,7 +83,7 @@ def test_the_share_of_active_rays(images, device):
 
 def test_errors_of_the_map(images, device):
     """Running sums of |D - D^|, capped; the pose counts; a missing depth counts nothing."""
-    scene = SceneMap(load_decoders(), GridConfig(), device, seed=1)
+    scene = SceneMap(load_decoders(), GridConfig(layout="dense"), device, seed=1)
     scene.cover(np.full(3, -2.5), np.full(3, 3.0))
     rgb, depth = np.zeros((CAMERA.height, CAMERA.width, 3), np.uint8), images.depth[1].numpy() * images.scale.numpy()[1]
     depth[:, : CAMERA.width // 2] = 0.0

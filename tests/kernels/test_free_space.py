@@ -25,7 +25,7 @@ LOW, HIGH = np.array([-1.0, -0.8, -0.6]), np.array([1.0, 0.9, 1.1])
 @pytest.fixture
 def scene_map(device) -> SceneMap:
     """A box of random features."""
-    scene_map = SceneMap(random_decoders(0), GridConfig(fine_spacing=0.16, color_spacing=0.16), device)
+    scene_map = SceneMap(random_decoders(0), GridConfig(fine_spacing=0.16, color_spacing=0.16, layout="dense"), device)
     scene_map.cover(LOW, HIGH)
     return scene_map
 

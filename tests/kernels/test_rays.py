@@ -41,7 +41,9 @@ def images(device):
 @pytest.fixture(scope="module")
 def scene_map(device):
     """A map around the origin with random features."""
-    scene = SceneMap(load_decoders(), GridConfig(middle_std=0.5, fine_std=0.1, color_std=0.3), device, seed=1)
+    scene = SceneMap(
+        load_decoders(), GridConfig(middle_std=0.5, fine_std=0.1, color_std=0.3, layout="dense"), device, seed=1
+    )
     scene.cover(np.array([-2.0, -2.0, -0.5]), np.array([2.0, 2.0, 2.5]))
     return scene
 

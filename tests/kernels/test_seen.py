@@ -27,7 +27,7 @@ RAYS = 3000
 @pytest.fixture
 def scene_map(device) -> SceneMap:
     """A box around a wall, of which nothing was seen."""
-    scene_map = SceneMap(random_decoders(0), GridConfig(fine_spacing=0.16, color_spacing=0.16), device)
+    scene_map = SceneMap(random_decoders(0), GridConfig(fine_spacing=0.16, color_spacing=0.16, layout="dense"), device)
     scene_map.cover(np.array([-2.0, -1.5, -0.2]), np.array([2.0, 1.5, 2.5]))
     return scene_map
 

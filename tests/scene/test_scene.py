@@ -17,7 +17,7 @@ DEVICES = ["cpu", *(str(d) for d in wp.get_cuda_devices())]
 
 
 def new_map(device: str, **settings) -> SceneMap:
-    return SceneMap(random_decoders(0), GridConfig(**settings), wp.get_device(device), seed=3)
+    return SceneMap(random_decoders(0), GridConfig(**{"layout": "dense", **settings}), wp.get_device(device), seed=3)
 
 
 @pytest.mark.parametrize("device", DEVICES)
