@@ -25,7 +25,7 @@ SETTINGS = [
 ]  # fmt: skip
 RENDERING = ["mapping.loss=rendering", "mapping.coarse=false", "mapping.iterations=6", "mapping.first_iterations=20"]
 
-BLOCKS = ["grid.layout=blocks"]
+DENSE = ["grid.layout=dense"]
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_what_moved_is_where_it_is_now(frames, path):
     assert np.median(after) < 2.0 * np.median(right)
 
 
-@pytest.mark.parametrize("overrides", [[], RENDERING, BLOCKS], ids=["direct", "rendering", "blocks"])
+@pytest.mark.parametrize("overrides", [DENSE, RENDERING, []], ids=["dense", "rendering", "blocks"])
 def test_the_rest_stays_to_the_byte(frames, path, overrides):
     """Vertices that no moved view reaches, the coarse level, the colour decoder, the current image; two runs agree."""
     both = []

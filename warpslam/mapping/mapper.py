@@ -317,7 +317,9 @@ class Mapper:
                     grid.lattice, grid.row_count, self.camera, T_world_camera, depth, self.config.frustum_margin
                 )
             if self._is_restricted and self._free is not None:
-                mask = mask & self._free.get(level, np.zeros(grid.row_count, bool))
+                # Rows that are newer are held, too.
+                free = self._free.get(level, np.zeros(0, bool))[: len(mask)]
+                mask = mask & np.pad(free, (0, len(mask) - len(free)))
             optimizer.begin(grid, mask)
             if level == "middle" and self._depth_start is not None and not everything:
                 self._depth_start.apply(grid, self.camera, T_world_camera, depth, optimizer.selected)
