@@ -247,7 +247,7 @@ def test_settings_of_a_loaded_map_can_change(frames, tmp_path):
 
 def test_saving_copies_no_grid(frames, tmp_path):
     """What saving allocates is small beside the grids."""
-    slam = run(frames[:1], "grid.margin=3")
+    slam = run(frames[:1], "grid.margin=3", "grid.layout=dense")
     size = sum(grid.features.capacity for grid in slam.scene.grids.values())
     tracemalloc.start()
     slam.save(tmp_path / "map.safetensors")
@@ -275,7 +275,8 @@ def test_image_budget_below_a_window_is_refused_at_once():
 
 def test_memory_report_adds_up(frames):
     """Bytes by part, and the observed volume: that of the cone before a wall."""
-    slam = Slam(CAMERA, Config.from_preset("default", SETTINGS), "cpu", decoders=load_decoders())
+    config = Config.from_preset("default", [*SETTINGS, "grid.layout=dense"])
+    slam = Slam(CAMERA, config, "cpu", decoders=load_decoders())
     slam.step(frames[0].rgb, np.full((36, 48), 3.0, np.float32))
     inventory = slam.inventory()
     report, observed = inventory["memory"], inventory["observed_volume_m3"]
