@@ -104,9 +104,9 @@ def test_methods_that_refine_otherwise(monkeypatch):
 
 # Seconds of (tracking, a call of mapping, the first call): few seconds on a GPU, minutes on a small CPU, direct loss.
 # And what a round of refinement costs, in calls: with the direct loss 42 iterations like the 15 of a call, and 60 of
-# rendering, with 48 samples a ray instead of 13.
+# rendering, with 48 samples a ray instead of 7.
 @pytest.mark.parametrize("seconds", [(0.02, 0.08, 0.6), (0.25, 9.0, 60.0), (0.1, 0.3, 4.0)])
-@pytest.mark.parametrize(("preset", "calls"), [("rendering", 1.0), ("default", 42 / 15 + 60 / 15 * 48 / 13)])
+@pytest.mark.parametrize(("preset", "calls"), [("rendering", 1.0), ("default", 42 / 15 + 60 / 15 * 5.4)])
 @pytest.mark.parametrize("every", [1, 2, 5])
 @pytest.mark.parametrize(("count", "spacing"), [(20, 20), (60, 20), (400, 12), (400, 20), (400, 30)])
 def test_right_within_half_after_ten_frames(monkeypatch, seconds, preset, calls, every, count, spacing):

@@ -23,6 +23,7 @@ _PROBE_RAYS = 400, 2500  # of two views: a launch costs the same for any number,
 _USUAL_KEYFRAMES, _USUAL_FRAMES = 2, 30  # so many in so many: what is expected before there are frames to go by
 _MESHING = 0.15  # of the time that rendering the panels takes
 # [s]. Neither the map nor its device has a part in these.
+_A_RAY = 2.0  # samples that take as long as a ray without any
 _EVALUATION, _EVALUATION_A_FRAME = 6.0, 0.08
 _PLOTS = 4.0  # mesh views and the report, too
 
@@ -139,7 +140,8 @@ class Forecast:
         if mapping.loss == "direct":  # as many samples a second, of which a ray of the rendering loss has more
             direct, sampling = self._config.supervision, self._config.sampling
             samples = direct.free_samples + direct.near_samples + 1
-            iterations = iterations * (sampling.stratified + sampling.surface) / samples + mapping.refined_directly
+            rendered = sampling.stratified + sampling.surface
+            iterations = iterations * (rendered + _A_RAY) / (samples + _A_RAY) + mapping.refined_directly
         # The first frame is one in any case, and tells nothing of how many follow.
         count = (len(keyframes) - 1 + _USUAL_KEYFRAMES) / (self._done + _USUAL_FRAMES) * self._total
         return call * iterations / mapping.iterations * mapping.rounds_for(round(count))
