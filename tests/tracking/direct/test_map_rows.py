@@ -20,7 +20,8 @@ AWAY = np.array([0.012, -0.008, 0.015, 0.004, -0.006, 0.003])
 @pytest.fixture(scope="module", params=wp.get_devices(), ids=str)
 def mapped(request) -> Slam:
     """A map of the room, from one frame by the direct loss; the frame is in slot 0 and in the registrar."""
-    config = Config.from_preset("live", ["mapping.pixels=400", "supervision.near_samples=8", "supervision.free_samples=4"])
+    sharp = ["supervision.near_samples=8", "supervision.free_samples=4"]
+    config = Config.from_preset("live", ["mapping.pixels=400", *sharp])
     slam = Slam(CAMERA, config, request.param)
     slam.step(*ROOM.take(CAMERA, np.eye(4), FrameMotion()), T_world_camera=np.eye(4))
     return slam
