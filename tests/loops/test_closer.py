@@ -78,6 +78,17 @@ def test_a_turn_closes(closed, frames, path):
         np.testing.assert_array_equal(keyframe.pose, closed.trajectory.poses[keyframe.index])
 
 
+def test_keyframes_that_came_together(frames, path, monkeypatch):
+    """They are looked at one after the other, though edges lead to later ones already, and the turn closes as well."""
+    slam = tracker()
+    with monkeypatch.context() as patch:
+        patch.setattr(slam.loops, "look", lambda history: None)
+        drive(slam, frames)
+    assert slam.loops.has_new
+    slam.loops.look(slam.history)
+    assert not slam.loops.has_new and furthest_turn(slam, path) < 1.0
+
+
 def test_saved_and_loaded_it_goes_on_alike(closed, frames, tmp_path):
     """The same bytes, stopped before the loop and between the loop and the end."""
     solved = max(b for _, b in closed.loops.account()["edges"])

@@ -209,7 +209,7 @@ class LoopCloser:
         near = {k: share for k, share in self.tracker.overlap.items() if k < before and self._is_expected(k, number)}
         expected = sorted(near, key=lambda k: -near[k])[:1]
         alike = self.index.likeliest(words, self.config.candidates, before, least=STAND_OUT)
-        parts = self.graph.parts(number + 1)
+        parts = self.graph.parts(len(self.tracker.keyframes))  # later ones, too: edges lead to them already
         others = parts[:before] != parts[number]
         if others.any():  # of other parts, too: nothing tells which of their places are near
             alike += self.index.likeliest(words, self.config.candidates, before, least=STAND_OUT, among=others)
