@@ -22,8 +22,8 @@ _PROBE_FRAME = 4  # the map has something in it, and everything is warm
 _PROBE_RAYS = 400, 2500  # of two views: a launch costs the same for any number, a ray something more
 _USUAL_KEYFRAMES, _USUAL_FRAMES = 2, 30  # so many in so many: what is expected before there are frames to go by
 _MESHING = 0.15  # of the time that rendering the panels takes
-# [s]. Neither the map nor its device has a part in these.
 _A_RAY = 2.0  # samples that take as long as a ray without any
+# [s]. Neither the map nor its device has a part in these.
 _EVALUATION, _EVALUATION_A_FRAME = 6.0, 0.08
 _PLOTS = 4.0  # mesh views and the report, too
 

@@ -8,25 +8,9 @@ from typing import Any
 
 import warp as wp
 
-from warpslam.kernels.decoder.layout import (
-    BIAS,
-    E0,
-    E3,
-    FC_BIAS,
-    V_T,
-    W1,
-    W1_T,
-    W2,
-    W2_T,
-    W3,
-    W3_T,
-    W4,
-    W4_T,
-    B,
-    V,
-    WeightGradient,
-    Weights,
-)
+from warpslam.kernels.decoder import layout
+from warpslam.kernels.decoder.embedding import EMBED
+from warpslam.kernels.decoder.layout import WeightGradient, Weights
 from warpslam.kernels.decoder.native import ADD_PRODUCT, VECTOR
 
 _SIZE = """
@@ -45,34 +29,6 @@ _ACTIVE = """
 #else
         return (wp::uint32)__builtin_ia32_movmskps256((decltype(x))(x > zero));
 #endif
-    };
-"""
-
-# `warpslam.kernels.decoder.embedding`, a register of channels at a time.
-_EMBED = """
-    // e = sin(p B) of 32 channels
-    auto embed = [](float* e, const float* positions, const float* angles) __attribute__((noinline)) {
-        for (int p = 0; p < size; ++p) {
-            const float p_0 = positions[3 * p], p_1 = positions[3 * p + 1], p_2 = positions[3 * p + 2];
-            #pragma unroll
-            for (int i = 0; i < 32; i += lanes) {
-                const vector b_0 = *(const vector*)(angles + i);
-                const vector b_1 = *(const vector*)(angles + 32 + i);
-                const vector b_2 = *(const vector*)(angles + 64 + i);
-                const vector x = p_0 * b_0 + p_1 * b_1 + p_2 * b_2;
-                const vector n = (x * 0.31830988618f + 12582912.0f) - 12582912.0f;
-                vector r = x - n * 3.140625f;
-                r = r - n * 0.0009675025939941406f;
-                r = r - n * 1.5099579909783765e-07f;
-                const vector half = (n * 0.5f + 12582912.0f) - 12582912.0f;
-                const vector odd = n - 2.0f * half;
-                const vector sign = 1.0f - 2.0f * odd * odd;
-                const vector q = r * r;
-                const vector s = r + r * q * (-0.16666667f + q * (0.0083333310f + q * (-0.00019840874f
-                    + q * (2.7525562e-06f - q * 2.3889859e-08f))));
-                *(vector*)(e + 32 * p + i) = sign * s;
-            }
-        }
     };
 """
 
@@ -181,13 +137,12 @@ _BACKWARD = """
 
 def cpu_forward_layers(build: Any, *, two_features: bool, keeps_activations: bool) -> Any:
     """`forward_layers` for the CPU."""
-    code = VECTOR + _SIZE + ADD_PRODUCT + _EMBED + _ACTIVE + _FORWARD
-    assert (W2, W3, W4) == (W1 + 32, W1 + 64, W1 + 96)
-    rows = {"BIAS": BIAS, "FC_BIAS": FC_BIAS, "E0": E0, "E3": E3, "W1": W1, "B": B, "V": V}
-    rows |= {"ROWS": 64 if two_features else 32, "KEEPS": int(keeps_activations)}
+    code = VECTOR + _SIZE + ADD_PRODUCT + EMBED + _ACTIVE + _FORWARD
+    others = {"ROWS": 64 if two_features else 32, "KEEPS": int(keeps_activations)}
+    constants = _constants("B", "BIAS", "E0", "E3", "FC_BIAS", "V", "W1", **others)
     Block, Indices, Positions = build.Block, build.Indices, build.Positions
 
-    @wp.func_native(_constants(rows) + code)
+    @wp.func_native(constants + code)
     def layers(
         positions: Positions, c: Block, m: Block, decoder: Weights, samples: Indices, kept: WeightGradient
     ) -> Block: ...
@@ -198,12 +153,11 @@ def cpu_forward_layers(build: Any, *, two_features: bool, keeps_activations: boo
 def cpu_backward_layers(build: Any, name: str, *, keeps_gradients: bool) -> Any:
     """`backward_layers` for the CPU."""
     code = VECTOR + _SIZE + ADD_PRODUCT + _BACKWARD
-    rows = {"BIAS": BIAS, "FC_BIAS": FC_BIAS, "W1_T": W1_T, "V_T": V_T, "KEEPS": int(keeps_gradients)}
-    assert (W2_T, W3_T, W4_T) == (W1_T + 32, W1_T + 64, W1_T + 96)
+    constants = _constants("BIAS", "FC_BIAS", "V_T", "W1_T", KEEPS=int(keeps_gradients))
     Block, Indices, size = build.Block, build.Indices, build.size
     Layers = wp.types.matrix(shape=(3 * size, 32), dtype=wp.float32)
 
-    @wp.func_native(_constants(rows) + code)
+    @wp.func_native(constants + code)
     def layers(
         g4: Block, decoder: Weights, samples: Indices, slot: int, rows: Indices, kept: WeightGradient
     ) -> Layers: ...
@@ -224,5 +178,7 @@ def cpu_backward_layers(build: Any, name: str, *, keeps_gradients: bool) -> Any:
     return build.func(layers_backward, f"{name}_layers_backward")
 
 
-def _constants(values: dict[str, int]) -> str:
+def _constants(*rows: str, **others: int) -> str:
+    """Where rows of weights lie, by the names of `warpslam.kernels.decoder.layout`, and other numbers."""
+    values = {name: getattr(layout, name) for name in rows} | others
     return "".join(f"    constexpr int {name} = {value};\n" for name, value in values.items())

@@ -8,10 +8,10 @@ from warpslam.kernels.grid import Vec32
 B = 0  # 3 chunks x 3 axes
 E0 = 9  # embedding -> layer 0, 96 rows (93 used)
 E3 = 105  # embedding -> layer 3
-W1 = 201
-W2 = 233
-W3 = 265
-W4 = 297
+W1 = 201  # W_1..W_4 lie one after the other
+W2 = W1 + 32
+W3 = W2 + 32
+W4 = W3 + 32
 BIAS = 329  # b_0..b_4
 FC_BIAS = 334  # d_0..d_4
 V = 339  # V_0..V_4, 32 rows each (fine: 64)
@@ -22,9 +22,9 @@ OUT_64 = V + 320
 E0_T = 0
 E3_T = 96
 W1_T = 192
-W2_T = 224
-W3_T = 256
-W4_T = 288
+W2_T = W1_T + 32
+W3_T = W2_T + 32
+W4_T = W3_T + 32
 V_T = 320  # V_k^T, only the part of the level's own feature
 
 # Rows of the packed and of the transposed weights of the coarse decoder.

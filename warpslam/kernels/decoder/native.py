@@ -81,13 +81,13 @@ ADD_PRODUCT = """
     };
 """
 
-_MATVEC_CPU = """
+_MATVEC_CPU = f"""
     constexpr int size = sizeof(r.data) / sizeof(r.data[0]);
-    ADD_PRODUCT
+{ADD_PRODUCT}
     auto s = r;
     add_product(&s.data[0][0], &x.data[0][0], (const float*)(W.data + row));
     return s;
-""".replace("ADD_PRODUCT", ADD_PRODUCT)
+"""
 
 # The same tiles, of four rows of the result.
 _ADD_OUTER = """
