@@ -126,7 +126,7 @@ def visible_points(
 
     from warpslam.field.arrays import struct
     from warpslam.kernels.raycast import DepthViews, mark_seen_points
-    from warpslam.runtime.launching import Launcher, Step
+    from warpslam.runtime.launching import Launcher
 
     device = wp.get_device("cpu")
     poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
@@ -154,12 +154,8 @@ def visible_points(
         height=k.height,
     )
     inputs = [given(points, wp.vec3d), views, wp.float64(tolerance), given(seen, wp.uint8)]
-
-    def steps(first: int, stop: int, slot: int) -> list[Step]:
-        return [(mark_seen_points, stop - first, [first, *inputs])]
-
     if len(points) and len(known):
-        Launcher(device).slices(len(points), steps)
+        Launcher(device).spread(mark_seen_points, len(points), inputs)
     return seen.astype(bool)
 
 

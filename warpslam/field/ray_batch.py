@@ -34,7 +34,7 @@ from warpslam.kernels.pixels import Draw, ErrorCells, Images, Pixels
 from warpslam.kernels.samples import Placement, Rays
 from warpslam.runtime.cores import slice_count
 from warpslam.runtime.environment import check_memory
-from warpslam.runtime.launching import Launcher, Step
+from warpslam.runtime.launching import Launcher
 
 if TYPE_CHECKING:
     from warpslam.field.objectives import MotionArrays
@@ -259,30 +259,18 @@ class RayBatch:
         if self.kernels.by_sample:
             self.launcher.launch(by_sample.place_samples, self.count * self.sample_count, inputs)
             return
-
-        def steps(first: int, stop: int, slot: int) -> list[Step]:
-            return [(samples.place_samples, stop - first, [first, *inputs])]
-
-        self.launcher.slices(self.count, steps)
+        self.launcher.spread(samples.place_samples, self.count, inputs)
 
     def look(self, arrays: FieldArrays, limit: float, looks: Looks) -> None:
         """Note of the cells of the fine level whether the logit of a sample in them is beyond ``limit``."""
         inputs = [arrays.lattices["fine"], self.rays, self.keep, self.logit, limit, looks]
-
-        def steps(first: int, stop: int, slot: int) -> list[Step]:
-            return [(free_space.look, stop - first, [first, *inputs])]
-
-        self.launcher.slices(self.count, steps)
+        self.launcher.spread(free_space.look, self.count, inputs)
 
     def leave_out_free(self, arrays: FieldArrays, looks: Looks) -> None:
         """Samples alone that are not in free space, so many a ray as the ray with most of them has."""
         counts = self.inlier  # nobody's before the loss
         inputs = [arrays.lattices["fine"], self.rays, self.keep, looks, counts]
-
-        def steps(first: int, stop: int, slot: int) -> list[Step]:
-            return [(free_space.take_wanted, stop - first, [first, *inputs])]
-
-        self.launcher.slices(self.count, steps)
+        self.launcher.spread(free_space.take_wanted, self.count, inputs)
         width = int(counts.numpy()[: self.count].max())
         z = self.z[: self.count * self.sample_count].reshape((self.count, self.sample_count))
         wp.copy(self.z, z[:, :width].contiguous().flatten())

@@ -13,7 +13,7 @@ from warpslam.camera import Intrinsics
 from warpslam.field.arrays import projection
 from warpslam.kernels import frustum, seen
 from warpslam.kernels.grid import Lattice
-from warpslam.runtime.launching import Launcher, Step
+from warpslam.runtime.launching import Launcher
 from warpslam.runtime.phases import phase
 
 if TYPE_CHECKING:
@@ -73,12 +73,21 @@ def mark_seen(grid: FeatureGrid, camera: Intrinsics, T_world_camera: np.ndarray,
         grid: `FeatureGrid.seen` becomes 1 there, and stays what it is elsewhere.
         camera, T_world_camera, depth: As in `select_in_frustum`.
     """
-    inputs = [grid.lattice, *projection(camera, T_world_camera), depth, REACH * grid.spacing, grid.seen]
+    mark_rows(grid, grid.lattice, grid.own_rows, camera, T_world_camera, depth, grid.seen)
 
-    def steps(first: int, stop: int, slot: int) -> list[Step]:
-        return [(seen.mark_seen, stop - first, [first, *inputs])]
 
-    Launcher(grid.device).slices(grid.own_rows, steps)
+def mark_rows(
+    grid: FeatureGrid,
+    lattice: Lattice,
+    count: int,
+    camera: Intrinsics,
+    T_world_camera: np.ndarray,
+    depth: wp.array,
+    marks: wp.array,
+) -> None:
+    """The same of ``count`` rows that belong to one vertex each, of a lattice like that of the grid, into ``marks``."""
+    inputs = [lattice, *projection(camera, T_world_camera), depth, REACH * grid.spacing, marks]
+    Launcher(grid.device).spread(seen.mark_seen, count, inputs)
 
 
 def measured_extent(

@@ -318,7 +318,7 @@ class Mapper:
                 )
             if self._is_restricted and self._free is not None:
                 # Rows that are newer are held, too.
-                free = self._free.get(level, np.zeros(0, bool))[: len(mask)]
+                free = self._free.get(level, np.zeros(0, bool))
                 mask = mask & np.pad(free, (0, len(mask) - len(free)))
             optimizer.begin(grid, mask)
             if level == "middle" and self._depth_start is not None and not everything:

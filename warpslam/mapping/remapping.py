@@ -16,10 +16,9 @@ import numpy as np
 import warp as wp
 
 from warpslam.camera import Intrinsics
-from warpslam.field.arrays import projection, struct
-from warpslam.kernels import seen
+from warpslam.field.arrays import struct
 from warpslam.kernels.grid import Lattice
-from warpslam.mapping.frustum import REACH, measured_extent
+from warpslam.mapping.frustum import mark_rows, measured_extent
 from warpslam.mapping.mapper import MappingResult
 from warpslam.poses import motion_between
 from warpslam.scene.feature_grid import FeatureGrid
@@ -207,14 +206,15 @@ def _touched(
 def touched_vertices(
     grid: FeatureGrid, camera: Intrinsics, views: Sequence[tuple[np.ndarray, np.ndarray]]
 ) -> np.ndarray:
-    """The same of one level: all corners of cells that have one in view, no further behind a surface than `REACH`."""
+    """The same of one level: all corners of cells that have one in view, no further behind a surface than
+    `warpslam.mapping.frustum.REACH`.
+    """
     lattice = struct(Lattice, **{part: getattr(grid.lattice, part) for part in ("origin", "inverse_spacing", "shape")})
     count = int(np.prod(grid.shape))
     mask = wp.zeros(count, dtype=wp.uint8, device=grid.device)
     for depth, T_world_camera in views:
         image = wp.array(depth, dtype=float, device=grid.device)
-        inputs = [0, lattice, *projection(camera, T_world_camera), image, REACH * grid.spacing]
-        wp.launch(seen.mark_seen, count, inputs, [mask], device=grid.device, record_tape=False)
+        mark_rows(grid, lattice, count, camera, T_world_camera, image, mask)
     touched = mask.numpy().reshape(grid.shape) != 0
     for axis in range(3):
         near, far = np.roll(touched, 1, axis), np.roll(touched, -1, axis)

@@ -19,7 +19,7 @@ from warpslam.camera import Intrinsics
 from warpslam.errors import InputError, MeshError
 from warpslam.kernels.visibility import NEAR, Views, classify_points, find_facing, find_reached
 from warpslam.runtime.environment import named_device
-from warpslam.runtime.launching import Launcher, Step
+from warpslam.runtime.launching import Launcher
 from warpslam.scene.mapped_views import ObservedView
 
 # The reference enlarges images by 1000 px; in focal lengths of its Replica camera (600 px), as images have many sizes.
@@ -99,12 +99,7 @@ class Evidence:
         state = wp.zeros(padded, dtype=wp.uint8, device=self.device)
         corner = wp.vec3i(*(int(i) - 1 for i in start))
         inputs = [corner, voxel, wp.array(visible, dtype=wp.int32, device=self.device), self._views]
-
-        def steps(first: int, stop: int, slot: int) -> list[Step]:
-            dim = (stop - first, *padded[1:])
-            return [(classify_points, dim, [first, *inputs, self.behind, self.band, state])]
-
-        self._launcher.slices(padded[0], steps)
+        self._launcher.spread(classify_points, padded, [*inputs, self.behind, self.band, state])
         states = state.numpy()
         near = states == NEAR
         near = near[:-2] | near[1:-1] | near[2:]
@@ -138,11 +133,7 @@ class Evidence:
         """
         facing = wp.zeros(len(points), dtype=wp.uint8, device=self.device)
         vectors = [wp.array(x, dtype=wp.vec3, device=self.device) for x in (points, normals, self.centers)]
-
-        def steps(first: int, stop: int, slot: int) -> list[Step]:
-            return [(find_facing, stop - first, [first, *vectors, self._views, least, most, facing])]
-
-        self._launcher.slices(len(points), steps)
+        self._launcher.spread(find_facing, len(points), [*vectors, self._views, least, most, facing])
         return facing.numpy().astype(bool)
 
 

@@ -101,6 +101,17 @@ class Launcher:
         if self._program is not None:
             self._program.add_slices(commands)
 
+    def spread(self, kernel: wp.Kernel, shape: int | tuple[int, ...], inputs: list) -> None:
+        """One launch on all cores: `slices` along the first axis of ``shape``. The kernel takes the first index of its
+        slice before ``inputs``.
+        """
+        count, *rest = (shape,) if isinstance(shape, int) else shape
+
+        def steps(first: int, stop: int, slot: int) -> list[Step]:
+            return [(kernel, (stop - first, *rest), [first, *inputs])]
+
+        self.slices(count, steps)
+
     def slice_commands(
         self, count: int, steps: Callable[[int, int, int], list[Step]], *, whole: bool = False
     ) -> list[list[wp.Launch]]:

@@ -11,7 +11,6 @@ from warpslam.field.ray_batch import image_struct
 from warpslam.kernels import grid as grid_kernels
 from warpslam.kernels.blocks import TILE, Reach, want_blocks
 from warpslam.kernels.grid import BLOCK, BLOCK_ROWS, Lattice, Vec32
-from warpslam.runtime.launching import Launcher, Step
 from warpslam.scene.feature_grid import FeatureGrid, GridState
 
 GROWTH = {"cpu": 4.0, "cuda": 1.5}
@@ -47,7 +46,6 @@ class BlockGrid(FeatureGrid):
         self._count = wp.zeros(1, dtype=int, device=device)
         self._corners = wp.zeros(1, dtype=wp.vec3i, device=device)
         super().__init__(level, spacing, std, seed, device, mean)
-        self._launcher = Launcher(device)
         self._reserve(BLOCK_ROWS)
         self._launcher.launch(grid_kernels.fill_shared, BLOCK_ROWS, [self._start(), self.features])
 
@@ -90,12 +88,7 @@ class BlockGrid(FeatureGrid):
         height, width = images[1].shape[1:]
         inputs = [self.lattice, wp.mat44(*T_world_camera.astype(np.float32).ravel().tolist()), camera_struct(camera)]
         inputs += [image_struct(images), slot, reach, self._wanted, self._count]
-
-        def steps(first: int, stop: int, part: int) -> list[Step]:
-            return [(want_blocks, stop - first, [first, *inputs])]
-
-        tiles = -(-width // TILE) * -(-height // TILE)
-        self._launcher.slices(tiles, steps, whole=self.device.is_cuda)
+        self._launcher.spread(want_blocks, -(-width // TILE) * -(-height // TILE), inputs)
         if not self._count.numpy()[0]:
             return np.zeros((0, 3), np.int64)
         wanted = self._wanted.numpy().reshape(self._table.shape) != 0

@@ -11,7 +11,7 @@ from warpslam.field.arrays import struct
 from warpslam.field.decoders import FEATURE_SIZE, LEVELS
 from warpslam.kernels import grid as grid_kernels
 from warpslam.kernels.grid import Lattice, Level, Start, Vec32
-from warpslam.runtime.launching import Launcher, Step
+from warpslam.runtime.launching import Launcher
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,7 @@ class FeatureGrid:
     ) -> None:
         self.level, self.spacing, self.std, self.seed, self.device = level, spacing, std, seed, device
         self.mean = np.zeros(FEATURE_SIZE, np.float32) if mean is None else mean
+        self._launcher = Launcher(device)
         self.first = np.zeros(3, np.int64)
         self.shape: tuple[int, int, int] = (0, 0, 0)
         self.features = wp.zeros(1, dtype=Vec32, device=device)
@@ -112,12 +113,7 @@ class FeatureGrid:
         self.features = wp.empty(self.row_count, dtype=Vec32, device=self.device)
         self.seen = wp.empty(self.row_count, dtype=wp.uint8, device=self.device)
         inputs = [self.lattice, wp.vec3i(*first), self._start(), old, old_seen, wp.vec3i(*shift)]
-
-        def steps(begin: int, end: int, slot: int) -> list[Step]:
-            dim = (end - begin, *shape[1:])
-            return [(grid_kernels.fill_grid, dim, [begin, *inputs, self.features, self.seen])]
-
-        Launcher(self.device).slices(shape[0], steps)
+        self._launcher.spread(grid_kernels.fill_grid, shape, [*inputs, self.features, self.seen])
 
     def renew(self, rows: np.ndarray) -> None:
         """Some rows, int (n,), become again what a new vertex is; `seen` says so, too."""

@@ -13,7 +13,7 @@ from warpslam.kernels import adam
 from warpslam.kernels.decoder.build import decoders_for
 from warpslam.kernels.decoder.layout import COLOR_WEIGHT_ROWS
 from warpslam.kernels.grid import Vec32
-from warpslam.runtime.launching import Launcher, Step
+from warpslam.runtime.launching import Launcher
 from warpslam.scene.feature_grid import FeatureGrid
 from warpslam.scene.touched_rows import TouchedRowsState
 
@@ -53,11 +53,7 @@ class RowOptimizer:
             self.launcher.launch(adam.adam_entries, (count, 32), [*inputs, self._rejected])
             return
         inputs = [self.rows, self.step, learning_rate, x, self.gradient, self.m, self.v, self._rejected]
-
-        def steps(first: int, stop: int, slot: int) -> list[Step]:
-            return [(adam.adam_rows, stop - first, [first, *inputs])]
-
-        self.launcher.slices(count, steps)
+        self.launcher.spread(adam.adam_rows, count, inputs)
 
     @property
     def has_rejected(self) -> bool:

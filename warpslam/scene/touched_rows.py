@@ -65,11 +65,7 @@ class TouchedRows:
         self._allocate(grid)
         if np.prod(old_shape):
             inputs = [old_lattice, shift, grid.lattice, old_moments, old_updates, self.moments, self.updates]
-
-            def steps(begin: int, end: int, slot: int) -> list[Step]:
-                return [(touched_rows.move_rows, (end - begin, *old_shape[1:]), [begin, *inputs])]
-
-            self.launcher.slices(old_shape[0], steps)
+            self.launcher.spread(touched_rows.move_rows, old_shape, inputs)
 
     def _allocate(self, grid: FeatureGrid) -> None:
         rows, device = grid.capacity, self.device
